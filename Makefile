@@ -1,0 +1,38 @@
+# Setting up, training and testing from a clean checkout: needs Python 3.11 with venv, and nothing else.
+PYTHON := $(shell command -v python3.11 || command -v python3)
+BIN := .venv/bin
+INSTALLED := .venv/installed
+
+.DEFAULT_GOAL := help
+.PHONY: help setup train test clean
+
+help: ## list the targets
+	@sed -n 's/^\([a-z]*\):[^#]*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
+
+setup: $(INSTALLED) ## install the project and its pinned dependencies into .venv (once, and again when they change)
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "setup: found no python3, wanted Python 3.11: apt-get install python3 python3-venv"; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "setup: $(PYTHON) is not Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || \
+		{ echo "setup: $(PYTHON) cannot make virtual environments: apt-get install python3-venv"; exit 1; }
+	@echo "setup 1/2: $$($(PYTHON) --version) into .venv"
+	@$(PYTHON) -m venv .venv
+	@echo "setup 2/2: the project and its pinned dependencies, some minutes the first time"
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test]'
+	@touch $@
+
+train: setup ## meta-train; its options go in ARGS: make train ARGS="--help"
+	$(BIN)/python -m services.meta_train $(ARGS)
+
+test: export OMP_NUM_THREADS = 1
+test: setup ## lint, format, types, then every test
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright
+	$(BIN)/python -m pytest
+
+clean: ## remove .venv, caches and builds; data/ and runs/ stay
+	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,1 @@
+"""Dual Meta Imitation Learning: the science, without Ray, MLflow or a simulator."""

@@ -1,0 +1,169 @@
+"""Settings of an experiment: frozen, checked, and each with the place in the paper that it comes from."""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+__all__ = [
+    "PRESETS",
+    "DemonstrationConfig",
+    "DmilConfig",
+    "EvaluationConfig",
+    "ExperimentConfig",
+    "SuiteConfig",
+    "TrainingConfig",
+]
+
+Count = Annotated[int, Field(ge=1)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class Settings(BaseModel):
+    """Base of all settings: unknown keys are refused, nothing changes once made."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class SuiteConfig(Settings):
+    """Which tasks there are, and when an episode counts as a success."""
+
+    name: Literal["ml10", "ml10-reference"] = "ml10"
+    """ml10: the benchmark's own split; ml10-reference: the split of the authors' released code."""
+    horizon: Count = 300
+    """Steps in an episode; it is a success if the task is solved at any of them."""
+    train_tasks: tuple[str, ...] | None = None
+    """Use these meta-training tasks instead of all of the suite's."""
+    test_tasks: tuple[str, ...] | None = None
+    """Use these meta-testing tasks instead of all of the suite's."""
+
+
+class DemonstrationConfig(Settings):
+    """How the scripted experts' demonstrations are collected."""
+
+    per_task: Count = 100
+    """Demonstrations of each task, training and held-out ones together."""
+    held_out: Count = 20
+    """Of these, how many are kept from meta-training, as support sets for evaluation."""
+    noise: NotNegative = 0.1
+    """Standard deviation of the noise added to the executed action; the clean action is stored."""
+    trailing_steps: Annotated[int, Field(ge=0)] = 10
+    """Steps recorded after the task is solved."""
+    seed: int = 0
+    """Names the demonstrations; they do not depend on the experiment's seed."""
+
+    @model_validator(mode="after")
+    def _leave_some_for_training(self) -> "DemonstrationConfig":
+        if self.held_out >= self.per_task:
+            raise ValueError(
+                f"held_out: got {self.held_out} of per_task {self.per_task}; wanted fewer, to train on the rest"
+            )
+        return self
+
+
+class DmilConfig(Settings):
+    """Dual Meta Imitation Learning."""
+
+    name: Literal["dmil"] = "dmil"
+    """The method."""
+    sub_skills: Count = 3
+    """K, the number of sub-skills (Table 4)."""
+    hidden_layers: Count = 4
+    """Layers of ReLU units in each network (F.2)."""
+    hidden_units: Count = 512
+    """Units in each hidden layer (F.2)."""
+    standardise: bool = True
+    """Standardise observations by the statistics of the meta-training demonstrations."""
+    inner_learning_rate: Positive = 5e-4
+    """α (Table 9)."""
+    inner_steps: Count = 3
+    """Steps of the inner loop, Table 9's fine-tune iterations."""
+    continuity_weight: NotNegative = 0.1
+    """λ (Table 9; Appendix C says 1)."""
+    order: Literal["first", "second"] = "second"
+    """Of the meta-gradient: exact, or taken at the adapted parameters."""
+    trajectories: Count = 16
+    """Trajectories in each of τ1 to τ4 (Table 9)."""
+    window: Count | None = None
+    """Cut each trajectory to so many steps at a random place; none takes it whole."""
+
+
+class TrainingConfig(Settings):
+    """The outer loop."""
+
+    iterations: Annotated[int, Field(ge=0)] = 2000
+    """Outer steps."""
+    tasks_per_iteration: Count = 10
+    """Tasks in a batch, sampled without replacement where there are enough."""
+    slots_per_group: Count = 5
+    """Tasks whose gradients one worker computes and adds together; part of the result, unlike the number of workers."""
+    learning_rate: Positive = 1e-4
+    """β of the outer Adam (Table 9)."""
+    gradient_clip: Positive | None = None
+    """Clip the outer gradient to this norm."""
+    checkpoint_every: Count = 200
+    """Iterations between checkpoints."""
+    checkpoints_kept: Count = 3
+    """The newest so many checkpoints are kept, besides the best."""
+
+
+class EvaluationConfig(Settings):
+    """Few-shot adaptation and the episodes that judge it."""
+
+    shots: tuple[Count, ...] = (1, 3)
+    """Sizes of the support set."""
+    episodes: Count = 20
+    """Episodes of each task for each size (Table 4)."""
+    support_draws: Count = 4
+    """Different support sets that a task's episodes are spread over."""
+    fine_tuning_steps: Annotated[int, Field(ge=0)] = 50
+    """Steps of adaptation to the support set (E.4)."""
+    learning_rate: Positive = 1e-2
+    """Of this adaptation (E.4)."""
+
+
+class ExperimentConfig(Settings):
+    """One experiment; with its data it determines every number that comes out."""
+
+    seed: int = 0
+    """Of the initial parameters, the task batches and the episodes."""
+    suite: SuiteConfig = SuiteConfig()
+    demonstrations: DemonstrationConfig = DemonstrationConfig()
+    method: DmilConfig = DmilConfig()
+    training: TrainingConfig = TrainingConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
+
+    @model_validator(mode="after")
+    def _enough_support(self) -> "ExperimentConfig":
+        wanted = max(self.evaluation.shots) * self.evaluation.support_draws
+        if self.demonstrations.held_out < wanted:
+            raise ValueError(
+                f"demonstrations.held_out: got {self.demonstrations.held_out}; wanted at least {wanted}, for "
+                f"{self.evaluation.support_draws} disjoint support sets of {max(self.evaluation.shots)}"
+            )
+        return self
+
+
+PRESETS: dict[str, ExperimentConfig] = {
+    "ml10-paper": ExperimentConfig(),
+    "ml10-quick": ExperimentConfig(
+        method=DmilConfig(
+            hidden_units=256,
+            inner_learning_rate=1e-2,
+            continuity_weight=0.0,
+            order="first",
+            trajectories=4,
+            window=24,
+        ),
+        training=TrainingConfig(iterations=4000, learning_rate=5e-4, gradient_clip=10.0, checkpoint_every=500),
+    ),
+    "ml10-smoke": ExperimentConfig(
+        suite=SuiteConfig(train_tasks=("reach", "push", "drawer-close"), test_tasks=("door-close",)),
+        demonstrations=DemonstrationConfig(per_task=12, held_out=4),
+        method=DmilConfig(hidden_units=32, hidden_layers=2, inner_learning_rate=1e-2, trajectories=2, window=24),
+        training=TrainingConfig(
+            iterations=20, tasks_per_iteration=3, slots_per_group=1, learning_rate=1e-3, checkpoint_every=10
+        ),
+        evaluation=EvaluationConfig(episodes=2, support_draws=1, fine_tuning_steps=5),
+    ),
+}

@@ -1,0 +1,159 @@
+"""Demonstrations, and the four disjoint sets of them that Algorithm 1 draws for a task."""
+
+import dataclasses
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32
+
+from dmil_core.errors import UserError
+
+__all__ = ["Demonstration", "DemonstrationError", "Standardisation", "TaskBatch", "digest", "sample_task_batch"]
+
+
+class DemonstrationError(UserError):
+    """A demonstration, or a set of them, that cannot be learned from."""
+
+
+@dataclass(frozen=True, eq=False)
+class Demonstration:
+    """One demonstrated trajectory of one task.
+
+    Args:
+        id: names the demonstration within its task; a result row refers to it.
+        task: the task's name.
+        observations: what the expert saw at each step, in the environment's units.
+        actions: what the expert did at each step, in the environment's units.
+
+    Raises:
+        DemonstrationError: for no step at all, unequal lengths, a wrong rank or a number that is not finite.
+    """
+
+    id: str
+    task: str
+    observations: Float32[np.ndarray, "steps obs_dim"]
+    actions: Float32[np.ndarray, "steps action_dim"]
+
+    def __post_init__(self) -> None:
+        for field in ("observations", "actions"):
+            values = getattr(self, field)
+            if values.ndim != 2 or values.shape[0] == 0 or values.shape[1] == 0:
+                raise DemonstrationError(
+                    f"demonstration {self.id} of {self.task}: {field} has the shape {values.shape}; "
+                    "wanted (steps, dimensions) with at least one of each; drop the demonstration"
+                )
+            if not np.isfinite(values).all():
+                step = int(np.argwhere(~np.isfinite(values).all(axis=1))[0, 0])
+                raise DemonstrationError(
+                    f"demonstration {self.id} of {self.task}: {field} at step {step} is not finite; "
+                    "wanted real numbers only; drop the demonstration or mend the step"
+                )
+        if len(self.observations) != len(self.actions):
+            raise DemonstrationError(
+                f"demonstration {self.id} of {self.task}: {len(self.observations)} observations for "
+                f"{len(self.actions)} actions; wanted one action for each observation"
+            )
+
+    def __len__(self) -> int:
+        return len(self.observations)
+
+    def window(self, start: int, steps: int) -> "Demonstration":
+        """Return the part of `steps` steps from `start` on, without a copy; its id says where it was cut."""
+        cut = slice(start, start + steps)
+        return dataclasses.replace(
+            self,
+            id=f"{self.id}[{start}:{start + steps}]",
+            observations=self.observations[cut],
+            actions=self.actions[cut],
+        )
+
+
+@dataclass(frozen=True)
+class TaskBatch:
+    """What one task contributes to one outer step: τ1 and τ2 to adapt to, τ3 and τ4 to judge by (Algorithm 1)."""
+
+    task: str
+    support_high: tuple[Demonstration, ...]
+    support_low: tuple[Demonstration, ...]
+    query_high: tuple[Demonstration, ...]
+    query_low: tuple[Demonstration, ...]
+
+    @property
+    def sets(self) -> tuple[tuple[Demonstration, ...], ...]:
+        """The four sets in the order of Algorithm 1: τ1, τ2, τ3, τ4."""
+        return self.support_high, self.support_low, self.query_high, self.query_low
+
+
+def sample_task_batch(
+    demonstrations: Sequence[Demonstration], trajectories: int, window: int | None, stream: np.random.Generator
+) -> TaskBatch:
+    """Draw {τ1}..{τ4} of Algorithm 1 for one task, `trajectories` in each.
+
+    The four sets are disjoint when the task has 4 x `trajectories` demonstrations; with fewer, each set is drawn
+    without replacement, and where even that is not possible, with it.
+
+    Args:
+        demonstrations: all training demonstrations of one task.
+        trajectories: the number of trajectories in each set.
+        window: cut each to so many consecutive steps at a random place; `None` takes them whole.
+        stream: where the choice comes from.
+
+    Raises:
+        DemonstrationError: if there is no demonstration.
+    """
+    total = len(demonstrations)
+    if total == 0:
+        raise DemonstrationError("demonstrations: got none for this task; wanted at least one; collect some first")
+    if total >= 4 * trajectories:
+        chosen = stream.permutation(total)[: 4 * trajectories].reshape(4, trajectories)
+    else:
+        chosen = np.stack([stream.choice(total, trajectories, replace=total < trajectories) for _ in range(4)])
+
+    def cut(demonstration: Demonstration) -> Demonstration:
+        if window is None or len(demonstration) <= window:
+            return demonstration
+        return demonstration.window(int(stream.integers(len(demonstration) - window + 1)), window)
+
+    sets = [tuple(cut(demonstrations[index]) for index in row) for row in chosen]
+    return TaskBatch(demonstrations[0].task, *sets)
+
+
+@dataclass(frozen=True, eq=False)
+class Standardisation:
+    """How observations are brought to zero mean and unit scale before a network sees them."""
+
+    mean: Float32[np.ndarray, " obs_dim"]
+    scale: Float32[np.ndarray, " obs_dim"]
+
+    @classmethod
+    def identity(cls, obs_dim: int) -> "Standardisation":
+        """Leave observations as they are."""
+        return cls(np.zeros(obs_dim, np.float32), np.ones(obs_dim, np.float32))
+
+    @classmethod
+    def of(cls, demonstrations: Sequence[Demonstration], floor: float = 0.02) -> "Standardisation":
+        """Take mean and standard deviation over all steps of `demonstrations`.
+
+        Args:
+            demonstrations: of all meta-training tasks.
+            floor: the least scale, in the observation's units: a coordinate that hardly moves in meta-training may
+                move in a new task, and must not then drown all others.
+        """
+        steps = np.concatenate([demonstration.observations for demonstration in demonstrations]).astype(np.float64)
+        return cls(steps.mean(0).astype(np.float32), np.maximum(steps.std(0), floor).astype(np.float32))
+
+    def __call__(self, observations: Float32[np.ndarray, "steps obs_dim"]) -> Float32[np.ndarray, "steps obs_dim"]:
+        """Return the standardised observations, a new array."""
+        return (observations - self.mean) / self.scale
+
+
+def digest(demonstrations: Sequence[Demonstration]) -> str:
+    """Return the SHA-256 of ids, shapes and values: equal digests mean equal data."""
+    sha = hashlib.sha256()
+    for demonstration in demonstrations:
+        sha.update(f"{demonstration.task}/{demonstration.id}{demonstration.actions.shape}".encode())
+        sha.update(np.ascontiguousarray(demonstration.observations).data)
+        sha.update(np.ascontiguousarray(demonstration.actions).data)
+    return sha.hexdigest()

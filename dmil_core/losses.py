@@ -1,0 +1,86 @@
+"""The losses of DMIL: equations 3, 4 and 15 of the paper, and the labels that tie its two levels together."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from dmil_core.demonstrations import Demonstration, Standardisation
+
+__all__ = ["Steps", "behaviour_cloning_loss", "continuity_loss", "high_level_loss", "sub_skill_labels", "switching"]
+
+
+class Steps(NamedTuple):
+    """The steps of several trajectories, one after the other."""
+
+    states: Float[Tensor, "steps obs_dim"]
+    actions: Float[Tensor, "steps action_dim"]
+    lengths: Int[Tensor, " trajectories"]
+
+    @classmethod
+    def of(cls, demonstrations: Sequence[Demonstration], standardise: Standardisation) -> "Steps":
+        """Copy demonstrations into fresh tensors: what a worker receives is shared memory and stays untouched."""
+        observations = np.concatenate([demonstration.observations for demonstration in demonstrations])
+        actions = np.concatenate([demonstration.actions for demonstration in demonstrations])
+        lengths = [len(demonstration) for demonstration in demonstrations]
+        return cls(torch.from_numpy(standardise(observations)), torch.from_numpy(actions), torch.tensor(lengths))
+
+
+def sub_skill_labels(
+    predictions: Float[Tensor, "sub_skills steps action_dim"], actions: Float[Tensor, "steps action_dim"]
+) -> Int[Tensor, " steps"]:
+    """Return argmin_k ‖π_k(s_t) − a_t‖² for each step: the E-step of the hard EM, without gradient (equation 3)."""
+    return (predictions.detach() - actions).square().sum(-1).argmin(0)
+
+
+def high_level_loss(
+    logits: Float[Tensor, "steps sub_skills"],
+    labels: Int[Tensor, " steps"],
+    lengths: Int[Tensor, " trajectories"],
+    continuity_weight: float,
+) -> Float[Tensor, ""]:
+    """Return the cross-entropy of π_h to the labels (equation 3) plus λ times the continuity loss (Appendix C)."""
+    loss = functional.cross_entropy(logits, labels)
+    return loss + continuity_weight * continuity_loss(logits.softmax(-1), lengths) if continuity_weight else loss
+
+
+def behaviour_cloning_loss(
+    predictions: Sequence[Float[Tensor, "_ action_dim"]], actions: Sequence[Float[Tensor, "_ action_dim"]]
+) -> Float[Tensor, ""]:
+    """Return Σ_k of sub-skill k's squared error ‖π_k(s) − a‖², averaged over its own states (equation 4).
+
+    Each sub-skill has its own average, so one with few states learns as fast as one with many; a sub-skill without
+    a state contributes nothing.
+
+    Args:
+        predictions: for each sub-skill its actions on its own states.
+        actions: for each sub-skill the demonstrated actions in those states.
+    """
+    errors = [
+        (own - wanted).square().sum(-1).mean() for own, wanted in zip(predictions, actions, strict=True) if len(own)
+    ]
+    return torch.stack(errors).sum()
+
+
+def switching(probabilities: Float[Tensor, "steps sub_skills"]) -> Float[Tensor, " pairs"]:
+    """Return the probability that independent draws at two consecutive steps differ: 1 − Σ_k p_t[k]·p_{t+1}[k]."""
+    return 1 - (probabilities[:-1] * probabilities[1:]).sum(-1)
+
+
+def continuity_loss(
+    probabilities: Float[Tensor, "steps sub_skills"], lengths: Int[Tensor, " trajectories"]
+) -> Float[Tensor, ""]:
+    """Return the expected number of switches per step, averaged over trajectories (equation 15, differentiable).
+
+    Equation 15 counts ẑ_{t+1} ≠ ẑ_t within a trajectory and divides by its length. The count has no gradient; its
+    expectation under independent draws from π_h has one, and equals the count when π_h is certain. A pair of steps
+    on both sides of a trajectory's end is no switch.
+    """
+    trajectory = torch.repeat_interleave(torch.arange(len(lengths)), lengths)
+    within = trajectory[1:] == trajectory[:-1]
+    weight = within / lengths[trajectory[:-1]]
+    return (switching(probabilities) * weight).sum() / len(lengths)

@@ -1,0 +1,103 @@
+"""Dual Meta Imitation Learning (Gao et al. 2022): both levels of a hierarchical policy are meta-learned.
+
+A high-level network π_h(z|s) picks one of K sub-skills π_k(a|s) at each step. Per task, the inner loop (Algorithm 1)
+alternates
+    θ_h ← θ_h − α ∇[CE(π_h, argmin_k ‖π_k(s) − a‖²) + λ L_aux]        on τ1 (equations 3 and 15),
+    θ_k ← θ_k − α ∇ mean ‖π_k(s) − a‖² over {s : argmax π_h(s) = k}    on τ2 (equation 4),
+and the outer loop descends the same losses at the adapted parameters on τ3 and τ4.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Int64
+
+from dmil_core import adaptation, meta_gradient
+from dmil_core.configs import DmilConfig
+from dmil_core.demonstrations import Demonstration, Standardisation, TaskBatch, sample_task_batch
+from dmil_core.losses import Steps
+from dmil_core.meta_gradient import TaskGradient
+from dmil_core.methods.base import Decision, FineTuning, SubSkillUse
+from dmil_core.networks import Parameters, bank, initialise, part
+
+__all__ = ["Dmil", "DmilPolicy"]
+
+
+@dataclass(frozen=True)
+class DmilPolicy:
+    """The most probable sub-skill acts: a = π_k(s), k = argmax π_h(s)."""
+
+    parameters: Parameters
+    standardise: Standardisation
+
+    def start(self, episodes: int) -> Int64[np.ndarray, "episodes 0"]:
+        """Return an empty memory: the choice depends on the state alone."""
+        return np.zeros((episodes, 0), np.int64)
+
+    @torch.no_grad()
+    def act(
+        self, observations: Float32[np.ndarray, "episodes obs_dim"], memory: Int64[np.ndarray, "episodes 0"]
+    ) -> Decision:
+        """Choose one action and its sub-skill for each episode."""
+        states = torch.from_numpy(self.standardise(observations))
+        chosen = adaptation.choose(part(self.parameters, "high"), states)
+        actions = bank(part(self.parameters, "low"), states)[chosen, torch.arange(len(states))]
+        return Decision(actions.numpy(), chosen.numpy(), memory)
+
+    @torch.no_grad()
+    def sub_skill_use(self, demonstration: Demonstration) -> SubSkillUse:
+        """Return the high level's choice and the argmin label (equation 3) at each step."""
+        steps = Steps.of([demonstration], self.standardise)
+        chosen = adaptation.choose(part(self.parameters, "high"), steps.states)
+        return SubSkillUse(chosen.numpy(), adaptation.label(part(self.parameters, "low"), steps).numpy())
+
+
+@dataclass(frozen=True)
+class Dmil:
+    """DMIL for observations and actions of given sizes."""
+
+    config: DmilConfig
+    action_dim: int
+    standardise: Standardisation
+
+    @property
+    def sub_skills(self) -> int:
+        """K."""
+        return self.config.sub_skills
+
+    def constants(self) -> Mapping[str, np.ndarray]:
+        """Return the observation statistics."""
+        return {"observation_mean": self.standardise.mean, "observation_scale": self.standardise.scale}
+
+    def initial_parameters(self, stream: np.random.Generator) -> Parameters:
+        """Draw the high level and the bank of sub-skills."""
+        hidden = [self.config.hidden_units] * self.config.hidden_layers
+        inputs = len(self.standardise.mean)
+        return {
+            **initialise("high", [inputs, *hidden, self.config.sub_skills], stream),
+            **initialise("low", [inputs, *hidden, self.action_dim], stream, copies=self.config.sub_skills),
+        }
+
+    def sample(self, demonstrations: Sequence[Demonstration], stream: np.random.Generator) -> TaskBatch:
+        """Draw τ1 to τ4."""
+        return sample_task_batch(demonstrations, self.config.trajectories, self.config.window, stream)
+
+    def task_gradient(self, parameters: Parameters, material: TaskBatch) -> TaskGradient:
+        """Return the outer gradient of Algorithm 1 for one task."""
+        sets = (Steps.of(demonstrations, self.standardise) for demonstrations in material.sets)
+        return meta_gradient.task_gradient(parameters, *sets, self.config)
+
+    def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> DmilPolicy:
+        """Run the dual inner loop with the support set as both τ1 and τ2."""
+        steps = Steps.of(support, self.standardise)
+        adapted = adaptation.adapt(
+            parameters,
+            steps,
+            steps,
+            steps=fine_tuning.steps,
+            learning_rate=fine_tuning.learning_rate,
+            continuity_weight=self.config.continuity_weight,
+        )
+        return DmilPolicy(adapted.parameters, self.standardise)

@@ -1,0 +1,121 @@
+"""The outer loop of Algorithm 1: which task sits in which slot, a group's gradient, and the step of Adam."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor
+
+from dmil_core.configs import TrainingConfig
+from dmil_core.demonstrations import Demonstration
+from dmil_core.meta_gradient import tree_sum
+from dmil_core.methods.base import MetaLearner
+from dmil_core.networks import Parameters
+from dmil_core.seeding import stream
+
+__all__ = ["GroupGradient", "OuterState", "OuterStep", "group_gradient", "groups", "tasks_of"]
+
+
+class GroupGradient(NamedTuple):
+    """The sum of a group's outer gradients, and the metrics of each of its slots."""
+
+    gradient: Float32[np.ndarray, " size"]
+    metrics: list[Mapping[str, float]]
+
+
+class OuterState(NamedTuple):
+    """All that the learner knows: after so many iterations, the parameters and both of Adam's moments, flat."""
+
+    iteration: int
+    parameters: Float32[np.ndarray, " size"]
+    first_moment: Float32[np.ndarray, " size"]
+    second_moment: Float32[np.ndarray, " size"]
+
+    @classmethod
+    def start(cls, parameters: Float32[np.ndarray, " size"]) -> "OuterState":
+        """Return the state before the first iteration."""
+        return cls(0, parameters, np.zeros_like(parameters), np.zeros_like(parameters))
+
+
+def tasks_of(iteration: int, tasks: Sequence[str], seed: int, slots: int) -> list[str]:
+    """Return the task of each slot of an iteration: every task once before any comes again."""
+    draw = stream(seed, "tasks", iteration)
+    rounds = -(-slots // len(tasks))
+    return [tasks[index] for _ in range(rounds) for index in draw.permutation(len(tasks))][:slots]
+
+
+def groups(training: TrainingConfig) -> list[range]:
+    """Return the slots that are computed and added together, group by group."""
+    slots, size = training.tasks_per_iteration, training.slots_per_group
+    return [range(first, min(first + size, slots)) for first in range(0, slots, size)]
+
+
+def group_gradient(
+    method: MetaLearner[Any],
+    demonstrations: Mapping[str, Sequence[Demonstration]],
+    parameters: Parameters,
+    seed: int,
+    iteration: int,
+    tasks: Sequence[str],
+    slots: Sequence[int],
+) -> GroupGradient:
+    """Return the summed outer gradient of some slots of an iteration: a pure function of its arguments.
+
+    Args:
+        method: what learns.
+        demonstrations: the training demonstrations of each meta-training task.
+        parameters: θ at the start of the iteration.
+        seed: of the experiment.
+        iteration: counts from 0.
+        tasks: the task of every slot of the iteration, see `tasks_of`.
+        slots: which of them to compute.
+    """
+    results = [
+        method.task_gradient(
+            parameters, method.sample(demonstrations[tasks[slot]], stream(seed, "batch", iteration, slot))
+        )
+        for slot in slots
+    ]
+    return GroupGradient(tree_sum([result.gradient for result in results]).numpy(), [r.metrics for r in results])
+
+
+class OuterStep:
+    """Adam on the flat parameter vector, its state to be taken out and put back at any iteration."""
+
+    def __init__(self, state: OuterState, learning_rate: float, gradient_clip: float | None) -> None:
+        """Continue from `state`.
+
+        Args:
+            state: where to go on; a fresh start is `OuterState.start`.
+            learning_rate: β.
+            gradient_clip: scale a longer gradient down to this norm first; `None` leaves it.
+        """
+        self._parameters = torch.nn.Parameter(torch.tensor(state.parameters))
+        self._clip = gradient_clip
+        self._adam = torch.optim.Adam([self._parameters], lr=learning_rate)
+        self._adam.state[self._parameters] = {
+            "step": torch.tensor(float(state.iteration)),
+            "exp_avg": torch.tensor(state.first_moment),
+            "exp_avg_sq": torch.tensor(state.second_moment),
+        }
+
+    @property
+    def parameters(self) -> Float[Tensor, " size"]:
+        """The current parameters, flat; the next step changes them in place."""
+        return self._parameters.detach()
+
+    def __call__(self, gradients: Sequence[Float32[np.ndarray, " size"]]) -> float:
+        """Add the groups' gradients in their fixed tree, take one step, and return the norm before clipping."""
+        self._parameters.grad = tree_sum([torch.tensor(gradient) for gradient in gradients])
+        norm = torch.nn.utils.clip_grad_norm_([self._parameters], float("inf") if self._clip is None else self._clip)
+        self._adam.step()
+        return norm.item()
+
+    @property
+    def state(self) -> OuterState:
+        """A copy of everything that the next step depends on."""
+        adam = self._adam.state[self._parameters]
+        moments = (adam[name].numpy().copy() for name in ("exp_avg", "exp_avg_sq"))
+        return OuterState(int(adam["step"]), self.parameters.numpy().copy(), *moments)

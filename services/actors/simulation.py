@@ -1,0 +1,65 @@
+"""The actor that runs experts and adapted policies in the simulator."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from dmil_core.configs import DemonstrationConfig, EvaluationConfig
+from dmil_core.demonstrations import Demonstration
+from dmil_core.methods.base import Method
+from dmil_core.networks import unflatten
+from dmil_core.seeding import stream_seed
+from services.rollouts import Trial, TrialOutcome, demonstrate, try_out
+from services.suites.base import Attempt, Environment, TaskSuite
+
+__all__ = ["SimulationWorker"]
+
+
+class SimulationWorker:
+    """Builds a task's environments once and uses them again; an episode depends on its seed alone."""
+
+    def __init__(self, suite: TaskSuite) -> None:
+        """Simulate the tasks of `suite`."""
+        torch.set_num_threads(1)
+        self._suite = suite
+        self._task: str | None = None
+        self._envs: list[Environment] = []
+
+    def _environments(self, task: str, count: int) -> list[Environment]:
+        if task != self._task:
+            self._task, self._envs = task, []
+        self._envs += [self._suite.make_env(task) for _ in range(count - len(self._envs))]
+        return self._envs
+
+    def attempts(self, task: str, numbers: Sequence[int], config: DemonstrationConfig) -> list[Attempt]:
+        """Let the expert try, once for each of `numbers`, which name the attempts."""
+        (env, *_), expert = self._environments(task, 1), self._suite.expert(task)
+        assert expert is not None
+        return [
+            demonstrate(
+                expert,
+                env,
+                stream_seed(config.seed, "demonstration", task, number),
+                self._suite.horizon,
+                config.noise,
+                config.trailing_steps,
+            )
+            for number in numbers
+        ]
+
+    def try_out(
+        self,
+        method: Method,
+        parameters: Float32[np.ndarray, " size"],
+        shapes: Mapping[str, torch.Size],
+        trial: Trial,
+        held_out: Sequence[Demonstration],
+        evaluation: EvaluationConfig,
+        seed: int,
+    ) -> TrialOutcome:
+        """Adapt and roll out one trial."""
+        envs = self._environments(trial.task, len(trial.episodes))
+        own = unflatten(torch.tensor(parameters), shapes)
+        return try_out(method, own, trial, held_out, envs, self._suite.horizon, evaluation, seed)

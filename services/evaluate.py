@@ -1,0 +1,65 @@
+"""Adapt a checkpoint to each task with few demonstrations, and measure the success rates of what comes out.
+
+Settings that are not given are those of the run that made the checkpoint.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from dmil_core.configs import EvaluationConfig
+from services.checkpoints import Checkpoint, Checkpoints
+from services.command_line import exit_code, parse, peek
+from services.demo_store import DemoStore, data_root
+from services.experiment import Experiment, RunnerKind, open_runner
+from services.progress import Clock
+from services.report import show, write_report
+from services.summary import summarise
+
+__all__ = ["Arguments", "run"]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Arguments of ``evaluate``."""
+
+    checkpoint: Path
+    """Folder of a checkpoint, or of a run, whose newest one is then taken."""
+    evaluation: EvaluationConfig
+    output: Path = Path("evaluation")
+    """Folder for the rows, the summary and the report."""
+    runner: RunnerKind = "ray"
+    """Where to work: in Ray actors, or in this process; the result is the same."""
+    workers: int | None = None
+    """Ray workers, one for each CPU of the cluster if not given."""
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run the program."""
+    path = peek(arguments, checkpoint=Path).checkpoint
+    if path is None:
+        parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, EvaluationConfig()))
+    checkpoint = (
+        Checkpoints(path / "checkpoints", kept=0).newest() if (path / "checkpoints").is_dir() else Checkpoint(path)
+    )
+    given = parse(Arguments, __doc__ or "", arguments, Arguments(path, checkpoint.manifest.config.evaluation))
+    config = checkpoint.manifest.config.model_copy(update={"evaluation": given.evaluation})
+    experiment = Experiment(config, DemoStore(data_root()))
+    given.output.mkdir(parents=True, exist_ok=True)
+    clock = Clock()
+    with open_runner(given.runner, experiment.suite, given.workers) as runner:
+        clock.lap("start")
+        data = experiment.collect(runner)
+        clock.lap("collect")
+        evaluation = experiment.evaluate(runner, data, checkpoint, given.output)
+        clock.lap("evaluate")
+    summary = summarise(evaluation, seconds=clock.seconds, folder=given.output)
+    write_report(summary, given.output)
+    show(summary)
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(run, sys.argv[1:]))

@@ -1,0 +1,304 @@
+"""One experiment, put together from its config once, for all programs: collect, meta-train, evaluate."""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from dmil_core.configs import ExperimentConfig
+from dmil_core.demonstrations import Demonstration, DemonstrationError, Standardisation
+from dmil_core.methods.dmil import Dmil
+from dmil_core.networks import Parameters, flatten, unflatten
+from dmil_core.outer_loop import OuterState, tasks_of
+from dmil_core.seeding import stream
+from dmil_core.statistics import share_entropy
+from services.checkpoints import Checkpoint, CheckpointError, Checkpoints, Manifest
+from services.demo_store import DemoStore, TaskDemonstrations
+from services.progress import Bar
+from services.provenance import library_versions
+from services.results import AdaptationResult, EpisodeResult, Split, write_rows
+from services.rollouts import Trial, TrialOutcome, trials
+from services.runners import LocalRunner, RayRunner, Runner
+from services.suites.base import Attempt, TaskSuite
+from services.suites.metaworld import MetaWorldSuite
+from services.summary import Evaluation
+from services.tracking import Tracker
+
+__all__ = ["Experiment", "RunnerKind", "open_runner"]
+
+RunnerKind = Literal["ray", "local"]
+CHUNK = 10
+"""Attempts of an expert in one call to a simulation worker."""
+PATIENCE = 10
+"""So many attempts for each wanted demonstration, then the expert is given up."""
+
+
+@contextmanager
+def open_runner(kind: RunnerKind, suite: TaskSuite, workers: int | None) -> Iterator[Runner]:
+    """Open a runner and close it in the end, whatever happens."""
+    runner: Runner = LocalRunner(suite) if kind == "local" else RayRunner(suite, workers)
+    try:
+        yield runner
+    finally:
+        runner.close()
+
+
+class Experiment:
+    """What a config describes: its suite, its demonstrations, its method, and the phases that use them."""
+
+    def __init__(self, config: ExperimentConfig, store: DemoStore) -> None:
+        """Put the experiment together; nothing runs yet.
+
+        Args:
+            config: all settings.
+            store: where its demonstrations are, or will be.
+        """
+        self.config = config
+        self.suite: TaskSuite = MetaWorldSuite(config.suite)
+        self.store = store
+
+    @property
+    def tasks(self) -> list[tuple[Split, str]]:
+        """All tasks with their split."""
+        return [
+            *(("meta-training", task) for task in self.suite.train_tasks),
+            *(("meta-testing", task) for task in self.suite.test_tasks),
+        ]
+
+    # Demonstrations
+
+    def collect(self, runner: Runner) -> dict[str, TaskDemonstrations]:
+        """Return every task's demonstrations, letting the experts make those that are not in the store.
+
+        The first successes in the order of the attempts' numbers are kept, so the outcome does not depend on who
+        simulates what.
+
+        Raises:
+            DemonstrationError: if an expert hardly ever succeeds.
+        """
+        names = dict.fromkeys(task for _, task in self.tasks)
+        ids = {task: self.store.dataset_id(task, self.config.suite, self.config.demonstrations) for task in names}
+        found = {task: self.store.load(dataset_id, task) for task, dataset_id in ids.items()}
+        if missing := [task for task, dataset in found.items() if dataset is None]:
+            for task, attempts in self._attempt(runner, missing).items():
+                solved = [index for index, attempt in enumerate(attempts) if attempt.solved_at is not None]
+                kept = solved[: self.config.demonstrations.per_task]
+                found[task] = self.store.save(
+                    ids[task],
+                    task,
+                    [attempts[index] for index in kept],
+                    failed=kept[-1] + 1 - len(kept),
+                    settings=self.config.demonstrations.model_dump(),
+                )
+        return {task: dataset for task, dataset in found.items() if dataset is not None}
+
+    def _attempt(self, runner: Runner, tasks: Sequence[str]) -> dict[str, list[Attempt]]:
+        """Return each task's attempts, in the order of their numbers, with enough successes among them."""
+        settings = self.config.demonstrations
+        attempts: dict[str, list[Attempt]] = {task: [] for task in tasks}
+
+        def lacking(task: str) -> int:
+            return settings.per_task - sum(attempt.solved_at is not None for attempt in attempts[task])
+
+        with Bar("collecting", len(tasks) * settings.per_task) as bar:
+            while open_tasks := [task for task in tasks if lacking(task) > 0]:
+                calls = []
+                for task in open_tasks:
+                    first = len(attempts[task])
+                    if first >= PATIENCE * settings.per_task:
+                        raise DemonstrationError(
+                            f"task {task}: its expert solved {settings.per_task - lacking(task)} of {first} attempts; "
+                            f"wanted {settings.per_task} demonstrations; take less noise or a longer horizon"
+                        )
+                    for start in range(first, first + lacking(task), CHUNK):
+                        numbers = range(start, min(start + CHUNK, first + lacking(task)))
+                        calls.append((task, numbers, settings))
+                results: dict[int, list[Attempt]] = {}
+                for index, made in runner.simulate("attempts", calls):
+                    results[index] = made
+                    bar.advance(sum(attempt.solved_at is not None for attempt in made), calls[index][0])
+                for index, call in enumerate(calls):
+                    attempts[call[0]] += results[index]
+        return attempts
+
+    def training_sets(self, data: Mapping[str, TaskDemonstrations]) -> dict[str, Sequence[Demonstration]]:
+        """Return what meta-training may see: the demonstrations of its tasks, without those held out."""
+        held_out = self.config.demonstrations.held_out
+        return {task: data[task].demonstrations[:-held_out] for task in self.suite.train_tasks}
+
+    def held_out_sets(self, data: Mapping[str, TaskDemonstrations]) -> dict[str, Sequence[Demonstration]]:
+        """Return what support sets are drawn from, for the tasks of both splits."""
+        held_out = self.config.demonstrations.held_out
+        return {task: data[task].demonstrations[-held_out:] for _, task in self.tasks}
+
+    # Meta-training
+
+    def method(self, training_sets: Mapping[str, Sequence[Demonstration]]) -> Dmil:
+        """Return the method, with what it learns once from the training demonstrations."""
+        settings = self.config.method
+        if settings.standardise:
+            standardise = Standardisation.of([d for task in training_sets.values() for d in task])
+        else:
+            standardise = Standardisation.identity(self.suite.obs_dim)
+        return Dmil(settings, self.suite.action_dim, standardise)
+
+    def initial_parameters(self, method: Dmil) -> Parameters:
+        """Draw the parameters that meta-training starts from."""
+        return method.initial_parameters(stream(self.config.seed, "initial parameters"))
+
+    def train(
+        self,
+        runner: Runner,
+        data: Mapping[str, TaskDemonstrations],
+        checkpoints: Checkpoints,
+        tracker: Tracker,
+        resume: Checkpoint | None = None,
+    ) -> Checkpoint:
+        """Meta-train to the set number of iterations and return the last checkpoint.
+
+        Stopped by Ctrl-C or SIGTERM, it writes a checkpoint first.
+
+        Args:
+            runner: does the work.
+            data: every task's demonstrations.
+            checkpoints: where to keep them.
+            tracker: takes the metrics of each iteration.
+            resume: go on from here.
+
+        Raises:
+            CheckpointError: if the checkpoint to go on from was trained on other demonstrations.
+        """
+        training = self.config.training
+        sets = self.training_sets(data)
+        method = self.method(sets)
+        initial = self.initial_parameters(method)
+        shapes = {name: tensor.shape for name, tensor in initial.items()}
+        digests = {task: dataset.digest for task, dataset in data.items()}
+        if resume is not None and resume.manifest.data != digests:
+            changed = [task for task in digests if resume.manifest.data.get(task) != digests[task]]
+            raise CheckpointError(
+                f"{resume.path}: trained on other demonstrations of {', '.join(changed)} than the store "
+                f"{self.store.root} holds; point DMIL_DATA to those it was trained on"
+            )
+        state = OuterState.start(flatten(initial).numpy()) if resume is None else resume.state
+
+        def save(loss: float | None) -> Path:
+            state = runner.state()
+            parameters = unflatten(torch.from_numpy(state.parameters), shapes)
+            manifest = Manifest(
+                iteration=state.iteration,
+                loss=loss,
+                config=self.config,
+                shapes={name: tuple(shape) for name, shape in shapes.items()},
+                data=digests,
+                versions=library_versions(),
+                mlflow_run_id=tracker.run_id,
+            )
+            arrays = {name: tensor.numpy() for name, tensor in parameters.items()}
+            return checkpoints.save(state, arrays, method.constants(), manifest)
+
+        if state.iteration >= training.iterations and resume is not None:
+            return resume
+        runner.start_training(method, shapes, sets, state, training, self.config.seed)
+        losses: list[float] = []
+        path = None
+        try:
+            with Bar("meta-training", training.iterations, state.iteration) as bar:
+                for iteration in range(state.iteration, training.iterations):
+                    began = time.perf_counter()
+                    tasks = tasks_of(iteration, self.suite.train_tasks, self.config.seed, training.tasks_per_iteration)
+                    slots, norm = runner.iterate(iteration, tasks)
+                    metrics = {name: float(np.mean([slot[name] for slot in slots])) for name in slots[0]}
+                    shares = np.array([metrics[f"sub_skill_share/{k}"] for k in range(method.sub_skills)])
+                    metrics["sub_skill_entropy"] = share_entropy(shares)
+                    metrics["gradient_norm"] = norm
+                    metrics["iterations_per_second"] = 1 / (time.perf_counter() - began)
+                    tracker.metrics(iteration + 1, metrics)
+                    losses.append(metrics["high_loss_after"] + metrics["low_loss_after"])
+                    bar.advance(
+                        1,
+                        f"losses {metrics['high_loss_after']:.3f} high, {metrics['low_loss_after']:.3f} low; "
+                        f"sub-skills in use {(shares > 0.01).sum()}/{method.sub_skills}; "
+                        f"{metrics['iterations_per_second']:.1f} iterations/s",
+                    )
+                    if (iteration + 1) % training.checkpoint_every == 0 or iteration + 1 == training.iterations:
+                        path = save(float(np.mean(losses)))
+                        losses.clear()
+            return Checkpoint(path or save(None))
+        except KeyboardInterrupt:
+            save(float(np.mean(losses)) if losses else None)
+            raise
+        finally:
+            runner.end_training()
+
+    # Evaluation
+
+    def evaluate(
+        self, runner: Runner, data: Mapping[str, TaskDemonstrations], checkpoint: Checkpoint, folder: Path
+    ) -> Evaluation:
+        """Adapt a checkpoint to every task of both splits, and return a row for each episode and adaptation.
+
+        The rows are also written to ``episodes.jsonl`` and ``adaptations.jsonl`` in `folder`.
+        """
+        evaluation = self.config.evaluation
+        held_out = self.held_out_sets(data)
+        method = Dmil(
+            self.config.method,
+            self.suite.action_dim,
+            Standardisation(checkpoint.constants["observation_mean"], checkpoint.constants["observation_scale"]),
+        )
+        shapes = {name: torch.Size(shape) for name, shape in checkpoint.manifest.shapes.items()}
+        plan = trials(self.tasks, evaluation)
+        shared_parameters = runner.share(checkpoint.state.parameters)
+        shared_sets = {task: runner.share(demonstrations) for task, demonstrations in held_out.items()}
+        calls = [
+            (method, shared_parameters, shapes, trial, shared_sets[trial.task], evaluation, self.config.seed)
+            for trial in plan
+        ]
+        outcomes: dict[int, TrialOutcome] = {}
+        successes = 0
+        with Bar("evaluating", sum(len(trial.episodes) for trial in plan)) as bar:
+            for index, outcome in runner.simulate("try_out", calls):
+                outcomes[index] = outcome
+                successes += sum(episode.success for episode in outcome.episodes)
+                bar.advance(len(plan[index].episodes), f"{successes} solved; {plan[index].task}")
+        common = {"suite": self.suite.name, "protocol": self.suite.protocol, "method": self.config.method.name}
+        common |= {"checkpoint": checkpoint.digest, "versions": library_versions()}
+        common |= {"fine_tuning_steps": evaluation.fine_tuning_steps, "learning_rate": evaluation.learning_rate}
+        episodes, adaptations = [], []
+        for index, trial in enumerate(plan):
+            row = common | {
+                "split": trial.split,
+                "task": trial.task,
+                "shots": trial.shots,
+                "draw": trial.draw,
+                "support": [demonstration.id for demonstration in trial.support(held_out[trial.task])],
+                "data": data[trial.task].digest,
+            }
+            episodes += _episode_rows(row, trial, outcomes[index])
+            adaptations.append(_adaptation_row(row, outcomes[index], method.sub_skills))
+        for name, rows in (("episodes.jsonl", episodes), ("adaptations.jsonl", adaptations)):
+            (folder / name).unlink(missing_ok=True)
+            write_rows(folder / name, rows)
+        failed = {task: dataset.failed for task, dataset in data.items()}
+        return Evaluation(checkpoint, self.suite.protocol, failed, episodes, adaptations)
+
+
+def _episode_rows(row: Mapping[str, object], trial: Trial, outcome: TrialOutcome) -> list[EpisodeResult]:
+    return [
+        EpisodeResult.model_validate({**row, "episode": number, **episode._asdict()})
+        for number, episode in zip(trial.episodes, outcome.episodes, strict=True)
+    ]
+
+
+def _adaptation_row(row: Mapping[str, object], outcome: TrialOutcome, sub_skills: int) -> AdaptationResult:
+    chosen = np.concatenate([use.chosen for use in outcome.use])
+    best = np.concatenate([use.best for use in outcome.use])
+    counts = np.bincount(chosen, minlength=sub_skills)
+    return AdaptationResult.model_validate(
+        {**row, "steps": len(chosen), "agreeing": int((chosen == best).sum()), "sub_skill_steps": counts.tolist()}
+    )

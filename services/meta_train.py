@@ -1,0 +1,131 @@
+"""Collect demonstrations, meta-train, adapt to unseen tasks and measure the success rates.
+
+Every setting is a flag; what is not given comes from the YAML file of --config, and else from --preset.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from dmil_core.configs import ExperimentConfig
+from services.checkpoints import Checkpoint, CheckpointError, Checkpoints
+from services.command_line import DEFAULT_PRESET, ConfigError, config_from, exit_code, parse, peek
+from services.demo_store import DemoStore, data_root
+from services.experiment import Experiment, RunnerKind, open_runner
+from services.progress import Clock, console
+from services.report import publish, show, write_report
+from services.summary import summarise
+from services.tracking import Tracker, introduce
+
+__all__ = ["Arguments", "run"]
+
+CHANGEABLE = {"iterations", "checkpoint_every", "checkpoints_kept"}
+"""Settings of meta-training that a resumed run may change without becoming another run."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Arguments of ``meta_train``."""
+
+    experiment: Annotated[ExperimentConfig, tyro.conf.arg(name="")]
+    preset: str = DEFAULT_PRESET
+    """Settings to begin with: ml10-quick, ml10-paper (Table 9 to the letter) or ml10-smoke."""
+    config: Path | None = None
+    """YAML file of settings in the preset's place, for example `method: {sub_skills: 5}`."""
+    runner: RunnerKind = "ray"
+    """Where to work: in Ray actors, or in this process; the result is the same to the bit."""
+    workers: int | None = None
+    """Ray workers of each kind, one for each CPU of the cluster if not given; they do not change the result."""
+    runs: Path = Path("runs")
+    """The folder that the run's own folder is made in."""
+    name: str | None = None
+    """Name of the run's folder; the preset's with the time if not given."""
+    resume: str | None = None
+    """Name or folder of a run to go on with, with its own settings."""
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run the program."""
+    given, folder, checkpoint = _read(arguments)
+    config = given.experiment
+    experiment = Experiment(config, DemoStore(data_root()))
+    checkpoints = Checkpoints(folder / "checkpoints", config.training.checkpoints_kept)
+    clock = Clock()
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "config.json").write_text(config.model_dump_json(indent=1) + "\n")
+    console.print(f"run: {folder}")
+    tracker = Tracker(folder, f"dmil-{config.suite.name}", console.print)
+    status = "FAILED"
+    try:
+        introduce(tracker, config)
+        with open_runner(given.runner, experiment.suite, given.workers) as runner:
+            clock.lap("start")
+            data = experiment.collect(runner)
+            tracker.inputs({dataset.id: dataset.digest for dataset in data.values()})
+            clock.lap("collect")
+            trained = experiment.train(runner, data, checkpoints, tracker, checkpoint)
+            clock.lap("train")
+            evaluation = experiment.evaluate(runner, data, trained, folder)
+            clock.lap("evaluate")
+        summary = summarise(evaluation, seconds=clock.seconds, folder=folder, mlflow_run_id=tracker.run_id)
+        write_report(summary, folder)
+        publish(tracker, summary, folder)
+        status = "FINISHED"
+    except KeyboardInterrupt:
+        status = "KILLED"
+        console.print(f"stopped; to go on: python -m services.meta_train --resume {folder}")
+        raise
+    finally:
+        if not tracker.close(status):
+            console.print(f"MLflow records that are not delivered wait in {folder / 'tracking.jsonl'}")
+    show(summary, tracker.uri)
+
+
+def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]:
+    """Return the arguments, the run's folder, and the checkpoint to go on from."""
+    early = peek(arguments, preset=str, config=Path, resume=str, runs=Path)
+    if early.resume is None:
+        defaults = config_from(early.preset or DEFAULT_PRESET, early.config)
+        given = parse(Arguments, __doc__ or "", arguments, Arguments(defaults))
+        folder = given.runs / (given.name or f"{given.preset}-{datetime.now():%Y%m%d-%H%M%S}")
+        if (folder / "config.json").exists():
+            raise ConfigError(f"--name: got {folder}, which holds a run; wanted a new name, or --resume {folder}")
+        return given, folder, None
+    folder = _find_run(early.resume, early.runs or Arguments.runs)
+    before = ExperimentConfig.model_validate_json((folder / "config.json").read_text())
+    given = parse(Arguments, __doc__ or "", arguments, Arguments(before))
+    _same_run(before, given.experiment)
+    saved = Checkpoints(folder / "checkpoints", given.experiment.training.checkpoints_kept)
+    return given, folder, saved.newest() if saved.all() else None
+
+
+def _find_run(name: str, runs: Path) -> Path:
+    for folder in (Path(name), runs / name):
+        if (folder / "config.json").is_file():
+            return folder
+    raise CheckpointError(f"--resume: got {name!r}; wanted a run's folder, or the name of one in {runs}")
+
+
+def _same_run(before: ExperimentConfig, now: ExperimentConfig) -> None:
+    """Refuse to go on under other settings than the run began with.
+
+    Raises:
+        ConfigError: names the sections that differ.
+    """
+    old, new = before.model_dump(exclude={"evaluation"}), now.model_dump(exclude={"evaluation"})
+    for setting in CHANGEABLE:
+        old["training"].pop(setting), new["training"].pop(setting)
+    if changed := [section for section in old if old[section] != new[section]]:
+        raise ConfigError(
+            f"--resume: got other settings of {', '.join(changed)} than the run began with; wanted the same, except "
+            f"for evaluation and training's {', '.join(sorted(CHANGEABLE))}; start a new run for others"
+        )
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(run, sys.argv[1:]))

@@ -1,0 +1,115 @@
+"""What a run shows at its end: the table on the terminal, and its report folder with tables and plots."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+from matplotlib import pyplot
+from matplotlib.axes import Axes
+
+from services.checkpoints import Checkpoint
+from services.progress import console
+from services.summary import Summary, table, table_markdown, write_summary
+from services.tracking import Tracker
+
+__all__ = ["draw_curves", "publish", "read_metrics", "show", "write_report"]
+
+PANELS: Mapping[str, tuple[str, ...]] = {
+    "high-level loss": ("high_loss_before", "high_loss_after"),
+    "sub-skill loss": ("low_loss_before", "low_loss_after"),
+    "continuity loss": ("continuity_loss",),
+    "share of states": ("sub_skill_share/",),
+    "agreement and usage entropy": ("agreement", "sub_skill_entropy"),
+    "gradient norm": ("gradient_norm",),
+}
+SMOOTHED = 50
+"""A curve is drawn through so many means at most."""
+
+
+def read_metrics(folder: Path) -> list[dict[str, float]]:
+    """Return the metrics of each iteration from a run's ``tracking.jsonl``; an iteration done again counts once."""
+    path = folder / "tracking.jsonl"
+    if not path.exists():
+        return []
+    by_step: dict[int, dict[str, float]] = {}
+    with path.open() as file:
+        for kind, value in map(json.loads, file):
+            if kind == "metrics":
+                by_step.setdefault(value["step"], {"iteration": value["step"]}).update(value["values"])
+    return [by_step[step] for step in sorted(by_step)]
+
+
+def draw_curves(metrics: list[dict[str, float]], path: Path) -> None:
+    """Draw losses, sub-skill usage and gradient norms over the iterations."""
+    figure, axes = pyplot.subplots(2, 3, figsize=(13, 6.5), layout="constrained")
+    for axis, (title, prefixes) in zip(axes.flat, PANELS.items(), strict=True):
+        _draw_panel(axis, title, prefixes, metrics)
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
+def _draw_panel(axis: Axes, title: str, prefixes: tuple[str, ...], metrics: list[dict[str, float]]) -> None:
+    for name in (name for name in metrics[-1] if name.startswith(prefixes)):
+        rows = [row for row in metrics if name in row]
+        size = -(-len(rows) // SMOOTHED)
+        parts = [rows[first : first + size] for first in range(0, len(rows), size)]
+        means = [sum(row[name] for row in part) / len(part) for part in parts]
+        axis.plot([part[-1]["iteration"] for part in parts], means, label=name.replace("_", " "))
+    axis.set(title=title, xlabel="iteration")
+    if "share" not in title and "agreement" not in title:
+        axis.set_yscale("symlog", linthresh=0.01)
+    axis.legend(fontsize="small")
+
+
+def write_report(summary: Summary, folder: Path) -> None:
+    """Write ``summary.json``, and the folder ``report`` with the tables and the curves."""
+    write_summary(summary, folder / "summary.json")
+    report = folder / "report"
+    report.mkdir(exist_ok=True)
+    (report / "table.md").write_text(table_markdown(summary))
+    if metrics := read_metrics(folder):
+        draw_curves(metrics, report / "curves.png")
+
+
+def publish(tracker: Tracker, summary: Summary, folder: Path) -> None:
+    """Record the success rates, of each task and in all, the report and the checkpoint on the MLflow run."""
+    rates: dict[str, float] = {}
+    for cell in summary.rows:
+        name = f"{cell.split}/{cell.shots}-shot"
+        rates |= {f"success_rate/{name}": cell.success_rate, f"success_rate_low/{name}": cell.low}
+        rates |= {f"success_rate_high/{name}": cell.high, f"episodes/{name}": float(cell.episodes)}
+        rates |= {f"task_success_rate/{name}/{task}": rate for task, rate in cell.per_task.items()}
+    for split, use in summary.sub_skills.items():
+        rates |= {f"agreement/{split}": use.agreement, f"sub_skill_entropy/{split}": use.entropy}
+    rates |= {f"seconds/{phase}": spent for phase, spent in summary.seconds.items()}
+    tracker.metrics(Checkpoint(Path(summary.checkpoint)).manifest.iteration, rates)
+    tracker.tags({"mlflow.note.content": table_markdown(summary)})
+    for path, destination in (
+        (folder / "report", "report"),
+        (folder / "summary.json", None),
+        (folder / "episodes.jsonl", None),
+        (Path(summary.checkpoint), "checkpoint"),
+    ):
+        tracker.artifact(path, destination)
+
+
+def show(summary: Summary, tracking_uri: str | None = None) -> None:
+    """Print the table, the use of sub-skills, the seconds, and where everything is."""
+    console.print(table(summary))
+    for split, use in summary.sub_skills.items():
+        shares = ", ".join(f"{share:.2f}" for share in use.share)
+        console.print(
+            f"{split}: sub-skills take {shares} of the states; {use.in_use_per_task:.1f} in use per task; "
+            f"the high level agrees with the best-fitting sub-skill on {use.agreement:.2f}"
+        )
+    if failed := {task: count for task, count in summary.failed_attempts.items() if count}:
+        console.print("failed expert attempts: " + ", ".join(f"{task} {count}" for task, count in failed.items()))
+    console.print("seconds: " + ", ".join(f"{phase} {spent:.0f}" for phase, spent in summary.seconds.items()))
+    console.print(f"checkpoint: {summary.checkpoint}\nreport: {summary.report}")
+    if tracking_uri is not None:
+        console.print(f"MLflow run: {summary.mlflow_run_id or 'not there yet'} at {tracking_uri}")
+        if tracking_uri.startswith("sqlite"):
+            console.print(f"to look at it: mlflow ui --backend-store-uri {tracking_uri} --host 127.0.0.1")

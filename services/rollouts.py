@@ -1,0 +1,146 @@
+"""Episodes of a policy or an expert in a suite's environments: pure, named by their seeds, no Ray."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from dmil_core.configs import EvaluationConfig
+from dmil_core.demonstrations import Demonstration
+from dmil_core.methods.base import FineTuning, Method, Policy, SubSkillUse
+from dmil_core.networks import Parameters
+from dmil_core.seeding import stream, stream_seed
+from services.results import Split
+from services.suites.base import Attempt, Environment, Expert
+
+__all__ = ["Episode", "Trial", "TrialOutcome", "demonstrate", "rollout", "trials", "try_out"]
+
+
+class Trial(NamedTuple):
+    """One adaptation to one support set, and the episodes that judge it."""
+
+    split: Split
+    task: str
+    shots: int
+    draw: int
+    episodes: tuple[int, ...]
+
+    def support(self, held_out: Sequence[Demonstration]) -> Sequence[Demonstration]:
+        """Return this draw's support set: draws of one size are disjoint."""
+        return held_out[self.draw * self.shots : (self.draw + 1) * self.shots]
+
+
+class Episode(NamedTuple):
+    """What came of one episode of a policy."""
+
+    seed: int
+    goal: list[float]
+    success: bool
+    steps: int
+    sub_skill_steps: list[int]
+    """How many steps each sub-skill acted, up to the highest one that did."""
+
+
+def rollout(policy: Policy, envs: Sequence[Environment], seeds: Sequence[int], horizon: int) -> list[Episode]:
+    """Run one episode for each seed, each in an environment of its own, with one call of the policy a step for all.
+
+    An episode ends at its first success, or after `horizon` steps without one.
+    """
+    observations, goals = [], []
+    for env, seed in zip(envs, seeds, strict=True):
+        observation, info = env.reset(seed=seed)
+        observations.append(observation)
+        goals.append(info["goal"])
+    alive = np.arange(len(seeds))
+    memory = policy.start(len(seeds))
+    success = np.zeros(len(seeds), bool)
+    choices: list[list[int]] = [[] for _ in seeds]
+    for _ in range(horizon):
+        decision = policy.act(np.asarray(observations, np.float32)[alive], memory)
+        for index, action, sub_skill in zip(alive, decision.actions, decision.sub_skills, strict=True):
+            space = envs[index].action_space
+            observations[index], _, _, _, info = envs[index].step(np.clip(action, space.low, space.high))
+            success[index] = info["success"]
+            choices[index].append(int(sub_skill))
+        going_on = ~success[alive]
+        alive, memory = alive[going_on], decision.memory[going_on]
+        if not len(alive):
+            break
+    return [
+        Episode(seed, goal, bool(done), len(chosen), np.bincount(chosen).tolist())
+        for seed, goal, done, chosen in zip(seeds, goals, success, choices, strict=True)
+    ]
+
+
+def demonstrate(
+    expert: Expert, env: Environment, seed: int, horizon: int, noise: float, trailing_steps: int
+) -> Attempt:
+    """Let an expert try once, and record what it saw and did until `trailing_steps` after its first success.
+
+    The environment executes the expert's action plus N(0, noise²), as in the authors' code; the action without the
+    noise is what is stored, clipped to the action space as the environment clips it.
+    """
+    disturbance = stream(seed, "expert noise")
+    space = env.action_space
+    observation, info = env.reset(seed=seed)
+    goal = info["goal"]
+    observations, actions = [observation], []
+    solved_at, end = None, horizon
+    while len(actions) < end:
+        action = np.clip(expert.get_action(observation), space.low, space.high)
+        actions.append(action)
+        executed = np.clip(action + disturbance.normal(0, noise, action.shape), space.low, space.high)
+        observation, _, _, _, info = env.step(executed.astype(np.float32))
+        observations.append(observation)
+        if info["success"] and solved_at is None:
+            solved_at = len(actions) - 1
+            end = min(horizon, len(actions) + trailing_steps)
+    return Attempt(seed, goal, solved_at, np.asarray(observations, np.float32), np.asarray(actions, np.float32))
+
+
+def trials(tasks: Sequence[tuple[Split, str]], evaluation: EvaluationConfig) -> list[Trial]:
+    """Return all adaptations of an evaluation, a task's episodes spread over its support sets."""
+    return [
+        Trial(split, task, shots, draw, tuple(range(draw, evaluation.episodes, evaluation.support_draws)))
+        for split, task in tasks
+        for shots in evaluation.shots
+        for draw in range(min(evaluation.support_draws, evaluation.episodes))
+    ]
+
+
+class TrialOutcome(NamedTuple):
+    """The episodes of a trial, and the sub-skills along the held-out demonstrations it did not adapt to."""
+
+    episodes: list[Episode]
+    use: list[SubSkillUse]
+
+
+def try_out(
+    method: Method,
+    parameters: Parameters,
+    trial: Trial,
+    held_out: Sequence[Demonstration],
+    envs: Sequence[Environment],
+    horizon: int,
+    evaluation: EvaluationConfig,
+    seed: int,
+) -> TrialOutcome:
+    """Adapt to a trial's support set and run its episodes: a pure function of its arguments.
+
+    Args:
+        method: what adapts.
+        parameters: meta-trained.
+        trial: which support set and episodes.
+        held_out: demonstrations of the task that meta-training has not seen.
+        envs: of the task, at least one for each episode.
+        horizon: steps in an episode.
+        evaluation: how to adapt.
+        seed: of the experiment; an episode is named by it, the task and the episode's number, so that all shots
+            and methods meet the same episodes.
+    """
+    support = trial.support(held_out)
+    policy = method.adapt(parameters, support, FineTuning(evaluation.fine_tuning_steps, evaluation.learning_rate))
+    seeds = [stream_seed(seed, "evaluation", trial.task, episode) for episode in trial.episodes]
+    others = [demonstration for demonstration in held_out if demonstration not in support]
+    episodes = rollout(policy, envs[: len(seeds)], seeds, horizon)
+    return TrialOutcome(episodes, [policy.sub_skill_use(demonstration) for demonstration in others])

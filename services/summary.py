@@ -1,0 +1,189 @@
+"""From result rows to the table that a run ends with."""
+
+from collections.abc import Sequence
+from itertools import groupby
+from operator import attrgetter
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import BaseModel
+from rich.table import Table
+
+from dmil_core.statistics import Rate, share_entropy, success_rate
+from services.checkpoints import Checkpoint
+from services.results import AdaptationResult, EpisodeResult, Split
+
+__all__ = [
+    "PAPER",
+    "Cell",
+    "Evaluation",
+    "SubSkillUse",
+    "Summary",
+    "cells",
+    "sub_skill_use",
+    "summarise",
+    "table",
+    "table_markdown",
+    "write_summary",
+]
+
+PAPER: dict[tuple[str, Split, int], float] = {
+    ("ml10", "meta-training", 1): 0.775,
+    ("ml10", "meta-training", 3): 0.949,
+    ("ml10", "meta-testing", 1): 0.396,
+    ("ml10", "meta-testing", 3): 0.710,
+}
+"""DMIL in Table 4, K = 3: by suite, split and shots."""
+
+
+class Evaluation(NamedTuple):
+    """What an evaluation found, and of what."""
+
+    checkpoint: Checkpoint
+    protocol: str
+    failed_attempts: dict[str, int]
+    episodes: list[EpisodeResult]
+    adaptations: list[AdaptationResult]
+
+
+class Cell(BaseModel):
+    """The success rate of one split and size of support set."""
+
+    suite: str
+    split: Split
+    shots: int
+    episodes: int
+    success_rate: float
+    low: float
+    high: float
+    per_task: dict[str, float]
+    paper: float | None
+    """The figure in Table 4, where it has one."""
+
+
+class SubSkillUse(BaseModel):
+    """How the adapted policies of one split use their sub-skills on held-out demonstrations."""
+
+    share: list[float]
+    """Of all states, the part that each sub-skill takes."""
+    entropy: float
+    """Of these shares: 0 if one takes all, 1 if all take the same."""
+    in_use_per_task: float
+    """Sub-skills with over a tenth of a task's states, on average over adaptations."""
+    agreement: float
+    """Of all states, the part where the high level takes the sub-skill that fits the demonstrated action best."""
+
+
+class Summary(BaseModel):
+    """``summary.json``: what came of a run."""
+
+    rows: list[Cell]
+    seconds: dict[str, float]
+    sub_skills: dict[Split, SubSkillUse]
+    protocol: str
+    seed: int
+    checkpoint: str
+    checkpoint_digest: str
+    report: str
+    mlflow_run_id: str | None
+    failed_attempts: dict[str, int]
+    """Attempts of each task's expert that were no success and so no demonstration."""
+
+
+def cells(episodes: Sequence[EpisodeResult]) -> list[Cell]:
+    """Return one cell for each split and size of support set, with Wilson intervals."""
+    key = attrgetter("suite", "split", "shots")
+    found = []
+    for (suite, split, shots), group in groupby(sorted(episodes, key=key), key=key):
+        rows = list(group)
+        rate: Rate = success_rate([row.success for row in rows])
+        tasks = dict.fromkeys(row.task for row in rows)
+        per_task = {task: float(np.mean([row.success for row in rows if row.task == task])) for task in tasks}
+        found.append(
+            Cell(
+                suite=suite,
+                split=split,
+                shots=shots,
+                episodes=rate.episodes,
+                success_rate=rate.rate,
+                low=rate.low,
+                high=rate.high,
+                per_task=per_task,
+                paper=PAPER.get((suite, split, shots)),
+            )
+        )
+    return sorted(found, key=lambda cell: (cell.suite, cell.split == "meta-testing", cell.shots))
+
+
+def sub_skill_use(adaptations: Sequence[AdaptationResult]) -> dict[Split, SubSkillUse]:
+    """Return the use of sub-skills in each split."""
+    use: dict[Split, SubSkillUse] = {}
+    for split in ("meta-training", "meta-testing"):
+        rows = [row for row in adaptations if row.split == split]
+        if not rows:
+            continue
+        steps = np.array([row.sub_skill_steps for row in rows])
+        share = steps.sum(0) / steps.sum()
+        use[split] = SubSkillUse(
+            share=share.tolist(),
+            entropy=share_entropy(share),
+            in_use_per_task=float((steps / steps.sum(1, keepdims=True) > 0.1).sum(1).mean()),
+            agreement=sum(row.agreeing for row in rows) / sum(row.steps for row in rows),
+        )
+    return use
+
+
+def summarise(
+    evaluation: Evaluation, *, seconds: dict[str, float], folder: Path, mlflow_run_id: str | None = None
+) -> Summary:
+    """Return the summary of an evaluation whose report is to lie in `folder`."""
+    return Summary(
+        rows=cells(evaluation.episodes),
+        seconds=seconds,
+        sub_skills=sub_skill_use(evaluation.adaptations),
+        protocol=evaluation.protocol,
+        seed=evaluation.checkpoint.manifest.config.seed,
+        checkpoint=str(evaluation.checkpoint.path),
+        checkpoint_digest=evaluation.checkpoint.digest,
+        report=str(folder / "report"),
+        mlflow_run_id=mlflow_run_id,
+        failed_attempts=evaluation.failed_attempts,
+    )
+
+
+def table(summary: Summary) -> Table:
+    """Lay the summary out for the terminal."""
+    view = Table(title=f"Success rates ({summary.protocol}; seed {summary.seed})")
+    for column in ("suite", "split", "shots", "successes", "success rate", "95% interval", "paper, Table 4"):
+        view.add_column(column, justify="left" if column in ("suite", "split") else "right")
+    for cell in summary.rows:
+        view.add_row(*_fields(cell))
+    return view
+
+
+def table_markdown(summary: Summary) -> str:
+    """Lay the summary out as Markdown, with the success rate of each task below."""
+    head = ("suite", "split", "shots", "successes", "success rate", "95% interval", "paper, Table 4")
+    lines = [_row(head), _row(["---"] * len(head)), *(_row(_fields(cell)) for cell in summary.rows)]
+    for split in dict.fromkeys(cell.split for cell in summary.rows):
+        cells = [cell for cell in summary.rows if cell.split == split]
+        lines += ["", _row(["task", *(f"{cell.shots}-shot" for cell in cells)]), _row(["---"] * (len(cells) + 1))]
+        lines += [_row([task, *(f"{cell.per_task[task]:.2f}" for cell in cells)]) for task in sorted(cells[0].per_task)]
+    return f"Protocol: {summary.protocol}; seed {summary.seed}.\n\n" + "\n".join(lines) + "\n"
+
+
+def _fields(cell: Cell) -> list[str]:
+    successes = f"{round(cell.success_rate * cell.episodes)}/{cell.episodes}"
+    interval = f"{cell.low:.3f} to {cell.high:.3f}"
+    paper = "" if cell.paper is None else f"{cell.paper:.3f}"
+    return [cell.suite, cell.split, str(cell.shots), successes, f"{cell.success_rate:.3f}", interval, paper]
+
+
+def _row(fields: Sequence[str]) -> str:
+    return f"| {' | '.join(fields)} |"
+
+
+def write_summary(summary: Summary, path: Path) -> None:
+    """Write ``summary.json``."""
+    path.write_text(summary.model_dump_json(indent=1) + "\n")

@@ -1,0 +1,71 @@
+"""What the tests of the science share: ragged trajectories and small networks."""
+
+from collections.abc import Callable, Sequence
+
+import hypothesis
+import numpy as np
+import pytest
+import torch
+
+from dmil_core.demonstrations import Demonstration
+from dmil_core.losses import Steps
+from dmil_core.networks import Parameters, initialise
+
+OBS_DIM, ACTION_DIM = 4, 3
+
+hypothesis.settings.register_profile("numbers", deadline=None, max_examples=50, derandomize=True)
+hypothesis.settings.load_profile("numbers")
+
+
+@pytest.fixture(scope="session")
+def make_steps() -> Callable[..., Steps]:
+    """Draw trajectories of the given lengths."""
+
+    def make(seed: int, lengths: Sequence[int], dtype: torch.dtype = torch.float64) -> Steps:
+        generator = torch.Generator().manual_seed(seed)
+        states, actions = (
+            torch.randn(sum(lengths), size, generator=generator, dtype=torch.float64).to(dtype)
+            for size in (OBS_DIM, ACTION_DIM)
+        )
+        return Steps(states, actions, torch.tensor(lengths))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def make_parameters() -> Callable[..., Parameters]:
+    """Draw a high level and a bank of sub-skills, biases too, so that nothing hides behind a zero."""
+
+    def make(
+        seed: int, sub_skills: int, hidden: Sequence[int] = (8, 8), dtype: torch.dtype = torch.float64
+    ) -> Parameters:
+        stream, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+        drawn = {
+            **initialise("high", [OBS_DIM, *hidden, sub_skills], stream),
+            **initialise("low", [OBS_DIM, *hidden, ACTION_DIM], stream, copies=sub_skills),
+        }
+        return {
+            name: (tensor + 0.3 * torch.randn(tensor.shape, generator=generator)).to(dtype)
+            for name, tensor in drawn.items()
+        }
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def make_demonstrations() -> Callable[..., list[Demonstration]]:
+    """Draw demonstrations of the given lengths for one task."""
+
+    def make(seed: int, lengths: Sequence[int]) -> list[Demonstration]:
+        stream = np.random.default_rng(seed)
+        return [
+            Demonstration(
+                f"d{index}",
+                "reach",
+                stream.normal(size=(length, OBS_DIM)).astype(np.float32),
+                stream.normal(size=(length, ACTION_DIM)).astype(np.float32),
+            )
+            for index, length in enumerate(lengths)
+        ]
+
+    return make

@@ -1,0 +1,203 @@
+"""The outer gradient against a plain twin and against finite differences, and the tree that adds gradients."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.nn import functional
+
+from dmil_core.configs import DmilConfig
+from dmil_core.losses import Steps
+from dmil_core.meta_gradient import task_gradient, tree_sum
+from dmil_core.networks import Parameters, flatten, unflatten
+
+LENGTHS = ([12, 1, 9], [3, 19], [1, 1, 16, 5], [11, 7])
+TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
+
+
+class Twin:
+    """Algorithm 1 for one task in plain autograd: every sub-skill on every state, masks, no function of the package."""
+
+    def __init__(self, config: DmilConfig) -> None:
+        self.config, self.unused = config, False
+
+    def network(self, tensors: dict, prefix: str, states: torch.Tensor, k: int | None = None) -> torch.Tensor:
+        layers = sum(name.startswith(prefix) and name.endswith("weight") for name in tensors)
+        for layer in range(layers):
+            weight, bias = tensors[f"{prefix}.{layer}.weight"], tensors[f"{prefix}.{layer}.bias"]
+            states = functional.linear(states, *((weight, bias) if k is None else (weight[k], bias[k])))
+            states = functional.relu(states) if layer < layers - 1 else states
+        return states
+
+    def errors(self, tensors: dict, steps: Steps) -> torch.Tensor:
+        """‖π_k(s_t) − a_t‖², a row for each sub-skill."""
+        skills = range(self.config.sub_skills)
+        return torch.stack(
+            [((self.network(tensors, "low", steps.states, k) - steps.actions) ** 2).sum(1) for k in skills]
+        )
+
+    def high_loss(self, tensors: dict, steps: Steps) -> torch.Tensor:
+        log_p = functional.log_softmax(self.network(tensors, "high", steps.states), dim=1)
+        labels = self.errors(tensors, steps).argmin(dim=0)
+        loss = -(log_p * functional.one_hot(labels, self.config.sub_skills)).sum() / len(labels)
+        switches = [(1 - (p[:-1] * p[1:]).sum(1)).sum() / len(p) for p in log_p.exp().split(steps.lengths.tolist())]
+        return loss + self.config.continuity_weight * sum(switches) / len(switches)
+
+    def low_loss(self, tensors: dict, steps: Steps) -> torch.Tensor:
+        chosen = self.network(tensors, "high", steps.states).argmax(dim=1)
+        mask = functional.one_hot(chosen, self.config.sub_skills).T
+        self.unused |= bool((mask.sum(1) == 0).any())
+        return ((self.errors(tensors, steps) * mask).sum(1) / mask.sum(1).clamp(min=1)).sum()
+
+    def descend(self, tensors: dict, prefix: str, loss: torch.Tensor) -> dict:
+        names = [name for name in tensors if name.startswith(prefix)]
+        gradients = torch.autograd.grad(loss, [tensors[name] for name in names], create_graph=True)
+        if self.config.order == "first":
+            gradients = [gradient.detach() for gradient in gradients]
+        stepped = {n: tensors[n] - self.config.inner_learning_rate * g for n, g in zip(names, gradients, strict=True)}
+        return {**tensors, **stepped}
+
+    def __call__(self, parameters: Parameters, sets: list[Steps]) -> tuple[torch.Tensor, float, float]:
+        """Return the outer gradient and both outer losses."""
+        leaves = {name: tensor.clone().requires_grad_() for name, tensor in parameters.items()}
+        tensors = dict(leaves)
+        for _ in range(self.config.inner_steps):
+            tensors = self.descend(tensors, "high", self.high_loss(tensors, sets[0]))
+            tensors = self.descend(tensors, "low", self.low_loss(tensors, sets[1]))
+        high, low = self.high_loss(tensors, sets[2]), self.low_loss(tensors, sets[3])
+        gradients = torch.autograd.grad(high + low, list(leaves.values()))
+        return torch.cat([gradient.flatten() for gradient in gradients]), high.item(), low.item()
+
+
+def relative_error(got: torch.Tensor, wanted: torch.Tensor) -> float:
+    return float((got - wanted).norm() / wanted.norm())
+
+
+def settings(sub_skills: int, **changes) -> DmilConfig:
+    return DmilConfig(**{"sub_skills": sub_skills, "inner_learning_rate": 0.05, "continuity_weight": 0.5, **changes})
+
+
+@pytest.fixture
+def sets(make_steps) -> list[Steps]:
+    return [make_steps(seed, lengths) for seed, lengths in enumerate(LENGTHS)]
+
+
+@pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
+@pytest.mark.parametrize("order", ["first", "second"])
+@pytest.mark.parametrize(("inner_steps", "continuity_weight"), [(1, 0.5), (2, 0.0), (3, 0.1), (3, 0.0)])
+@pytest.mark.parametrize("sub_skills", [1, 2, 3, 5, 8, 10])
+def test_equals_the_plain_twin(
+    make_parameters, make_steps, sub_skills, inner_steps, continuity_weight, order, dtype
+) -> None:
+    config = settings(sub_skills, inner_steps=inner_steps, continuity_weight=continuity_weight, order=order)
+    parameters = make_parameters(sub_skills, sub_skills, dtype=dtype)
+    sets = [make_steps(seed, lengths, dtype) for seed, lengths in enumerate(LENGTHS)]
+    got = task_gradient(parameters, *sets, config)
+    gradient, high, low = Twin(config)(parameters, sets)
+    assert got.gradient.dtype == dtype
+    assert relative_error(got.gradient, gradient) <= TOLERANCE[dtype]
+    assert got.metrics["high_loss_after"] == pytest.approx(high, rel=TOLERANCE[dtype], abs=TOLERANCE[dtype])
+    assert got.metrics["low_loss_after"] == pytest.approx(low, rel=TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("order", ["first", "second"])
+@pytest.mark.parametrize("continuity_weight", [0.0, 0.5])
+@pytest.mark.parametrize("sub_skills", [2, 5])
+def test_equals_the_plain_twin_where_only_the_last_sub_skill_is_used(
+    make_parameters, sets, sub_skills, continuity_weight, order
+) -> None:
+    parameters = make_parameters(0, sub_skills)
+    parameters["high.2.bias"][-1] += 8
+    config = settings(sub_skills, continuity_weight=continuity_weight, order=order)
+    twin, got = Twin(config), task_gradient(parameters, *sets, config)
+    assert relative_error(got.gradient, twin(parameters, sets)[0]) <= 1e-10
+    assert twin.unused
+    assert got.metrics[f"sub_skill_share/{sub_skills - 1}"] == 1
+    unused = unflatten(got.gradient, {name: tensor.shape for name, tensor in parameters.items()})["low.0.weight"][:-1]
+    assert torch.equal(unused, torch.zeros_like(unused))
+
+
+@pytest.mark.parametrize("inner_steps", [1, 3])
+@pytest.mark.parametrize("sub_skills", [1, 3])
+def test_second_order_equals_central_differences(make_parameters, sets, sub_skills: int, inner_steps: int) -> None:
+    parameters = make_parameters(3, sub_skills)
+    shapes = {name: tensor.shape for name, tensor in parameters.items()}
+    origin, generator, step = flatten(parameters), torch.Generator().manual_seed(0), 1e-6
+
+    def outer_loss(vector: torch.Tensor) -> float:
+        metrics = task_gradient(unflatten(vector, shapes), *sets, settings(sub_skills, order="first")).metrics
+        return metrics["high_loss_after"] + metrics["low_loss_after"]
+
+    def gradient(order: str) -> torch.Tensor:
+        return task_gradient(parameters, *sets, settings(sub_skills, order=order)).gradient
+
+    directions = torch.randn(6, len(origin), generator=generator, dtype=torch.float64)
+    directions = functional.normalize(directions, dim=1)
+    differences = torch.tensor(
+        [(outer_loss(origin + step * d) - outer_loss(origin - step * d)) / (2 * step) for d in directions],
+        dtype=torch.float64,
+    )
+    assert relative_error(directions @ gradient("second"), differences) < 1e-6
+    assert relative_error(directions @ gradient("first"), differences) > 1e-2
+
+
+def test_orders_agree_as_the_inner_learning_rate_vanishes(make_parameters, sets) -> None:
+    parameters = make_parameters(0, 3)
+
+    def gap(learning_rate: float) -> float:
+        first, second = (
+            task_gradient(parameters, *sets, settings(3, inner_learning_rate=learning_rate, order=order)).gradient
+            for order in ("first", "second")
+        )
+        return relative_error(first, second)
+
+    assert gap(0.05) > 1e-2
+    assert gap(1e-8) < 1e-5
+
+
+@pytest.mark.parametrize("order", ["first", "second"])
+def test_is_a_pure_function(make_parameters, sets, order: str) -> None:
+    parameters = make_parameters(0, 3)
+    tensors = [*parameters.values(), *(tensor for steps in sets for tensor in steps)]
+    before = [tensor.clone() for tensor in tensors]
+    once, again = (task_gradient(parameters, *sets, settings(3, order=order)) for _ in range(2))
+    assert torch.equal(once.gradient, again.gradient)
+    assert once.metrics == again.metrics
+    assert not once.gradient.requires_grad
+    assert all(map(torch.equal, tensors, before))
+    assert not any(tensor.requires_grad or tensor.grad is not None for tensor in tensors)
+
+
+def test_metrics_say_how_the_sub_skills_are_used(make_parameters, sets) -> None:
+    metrics = task_gradient(make_parameters(1, 3), *sets, settings(3)).metrics
+    shares = [metrics[f"sub_skill_share/{k}"] for k in range(3)]
+    assert sum(shares) == pytest.approx(1)
+    assert all(share * sum(LENGTHS[3]) == pytest.approx(round(share * sum(LENGTHS[3]))) for share in shares)
+    assert 0 <= metrics["agreement"] <= 1
+    assert 0 <= metrics["continuity_loss"] <= 1
+
+
+def recursive_sum(terms: list[torch.Tensor]) -> torch.Tensor:
+    """Split at the greatest power of two below the length."""
+    if len(terms) == 1:
+        return terms[0]
+    half = 1 << (len(terms) - 1).bit_length() - 1
+    return recursive_sum(terms[:half]) + recursive_sum(terms[half:])
+
+
+@given(st.integers(1, 17), st.integers(0, 2**31))
+def test_tree_sum_adds_neighbours_first(count: int, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    terms = [10 ** (6 * torch.rand(5, generator=generator)) * torch.randn(5, generator=generator) for _ in range(count)]
+    before = torch.stack(terms)
+    total = tree_sum(terms)
+    assert torch.equal(total, recursive_sum(terms))
+    assert torch.equal(total, tree_sum(tuple(term.clone() for term in terms)))
+    assert torch.equal(torch.stack(terms), before)
+    torch.testing.assert_close(total.double(), before.double().sum(0), rtol=1e-5, atol=10)
+
+
+def test_tree_sum_takes_its_order_from_the_terms_alone() -> None:
+    large, one = torch.tensor([1e8]), torch.tensor([1.0])
+    assert tree_sum([large, one, -large, one]).item() == 0
+    assert tree_sum([large, -large, one, one]).item() == 2
