@@ -82,7 +82,8 @@ def adapt(
         objective = sub_skill_objective(low, support_low, chosen)
         low = _descend(low, objective, learning_rate, differentiable)
         low_losses.append(objective.item())
-    return Adapted({**high, **low}, tuple(high_losses), tuple(low_losses))
+    adapted = {**high, **low}
+    return Adapted({name: adapted[name] for name in parameters}, tuple(high_losses), tuple(low_losses))
 
 
 def _trainable(parameters: Parameters, differentiable: bool) -> Parameters:

@@ -15,6 +15,7 @@ __all__ = [
 ]
 
 Count = Annotated[int, Field(ge=1)]
+Seed = Annotated[int, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
@@ -32,9 +33,9 @@ class SuiteConfig(Settings):
     """ml10: the benchmark's own split; ml10-reference: the split of the authors' released code."""
     horizon: Count = 300
     """Steps in an episode; it is a success if the task is solved at any of them."""
-    train_tasks: tuple[str, ...] | None = None
+    train_tasks: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     """Use these meta-training tasks instead of all of the suite's."""
-    test_tasks: tuple[str, ...] | None = None
+    test_tasks: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     """Use these meta-testing tasks instead of all of the suite's."""
 
 
@@ -49,7 +50,7 @@ class DemonstrationConfig(Settings):
     """Standard deviation of the noise added to the executed action; the clean action is stored."""
     trailing_steps: Annotated[int, Field(ge=0)] = 10
     """Steps recorded after the task is solved."""
-    seed: int = 0
+    seed: Seed = 0
     """Names the demonstrations; they do not depend on the experiment's seed."""
 
     @model_validator(mode="after")
@@ -95,7 +96,7 @@ class TrainingConfig(Settings):
     """Outer steps."""
     tasks_per_iteration: Count = 10
     """Tasks in a batch, sampled without replacement where there are enough."""
-    slots_per_group: Count = 5
+    slots_per_group: Count = 1
     """Tasks whose gradients one worker computes and adds together; part of the result, unlike the number of workers."""
     learning_rate: Positive = 1e-4
     """β of the outer Adam (Table 9)."""
@@ -110,7 +111,7 @@ class TrainingConfig(Settings):
 class EvaluationConfig(Settings):
     """Few-shot adaptation and the episodes that judge it."""
 
-    shots: tuple[Count, ...] = (1, 3)
+    shots: Annotated[tuple[Count, ...], Field(min_length=1)] = (1, 3)
     """Sizes of the support set."""
     episodes: Count = 20
     """Episodes of each task for each size (Table 4)."""
@@ -125,7 +126,7 @@ class EvaluationConfig(Settings):
 class ExperimentConfig(Settings):
     """One experiment; with its data it determines every number that comes out."""
 
-    seed: int = 0
+    seed: Seed = 0
     """Of the initial parameters, the task batches and the episodes."""
     suite: SuiteConfig = SuiteConfig()
     demonstrations: DemonstrationConfig = DemonstrationConfig()
@@ -148,14 +149,17 @@ PRESETS: dict[str, ExperimentConfig] = {
     "ml10-paper": ExperimentConfig(),
     "ml10-quick": ExperimentConfig(
         method=DmilConfig(
+            hidden_layers=3,
             hidden_units=256,
-            inner_learning_rate=1e-2,
+            inner_learning_rate=5e-3,
             continuity_weight=0.0,
             order="first",
             trajectories=4,
             window=24,
         ),
-        training=TrainingConfig(iterations=4000, learning_rate=5e-4, gradient_clip=10.0, checkpoint_every=500),
+        training=TrainingConfig(
+            iterations=4500, slots_per_group=5, learning_rate=5e-4, gradient_clip=10.0, checkpoint_every=500
+        ),
     ),
     "ml10-smoke": ExperimentConfig(
         suite=SuiteConfig(train_tasks=("reach", "push", "drawer-close"), test_tasks=("door-close",)),

@@ -60,7 +60,13 @@ class Demonstration:
         return len(self.observations)
 
     def window(self, start: int, steps: int) -> "Demonstration":
-        """Return the part of `steps` steps from `start` on, without a copy; its id says where it was cut."""
+        """Return the part of `steps` steps from `start` on, without a copy; its id says where it was cut.
+
+        Raises:
+            IndexError: if it does not lie inside the demonstration.
+        """
+        if not 0 <= start <= start + steps <= len(self):
+            raise IndexError(f"window: got {steps} steps from {start} of {len(self)}; wanted a part of them")
         cut = slice(start, start + steps)
         return dataclasses.replace(
             self,
@@ -153,7 +159,8 @@ def digest(demonstrations: Sequence[Demonstration]) -> str:
     """Return the SHA-256 of ids, shapes and values: equal digests mean equal data."""
     sha = hashlib.sha256()
     for demonstration in demonstrations:
-        sha.update(f"{demonstration.task}/{demonstration.id}{demonstration.actions.shape}".encode())
+        shapes = demonstration.observations.shape, demonstration.actions.shape
+        sha.update(repr((demonstration.task, demonstration.id, *shapes)).encode())
         sha.update(np.ascontiguousarray(demonstration.observations).data)
         sha.update(np.ascontiguousarray(demonstration.actions).data)
     return sha.hexdigest()

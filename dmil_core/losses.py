@@ -82,5 +82,5 @@ def continuity_loss(
     """
     trajectory = torch.repeat_interleave(torch.arange(len(lengths)), lengths)
     within = trajectory[1:] == trajectory[:-1]
-    weight = within / lengths[trajectory[:-1]]
+    weight = within.to(probabilities.dtype) / lengths[trajectory[:-1]]
     return (switching(probabilities) * weight).sum() / len(lengths)

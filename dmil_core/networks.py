@@ -40,7 +40,7 @@ def initialise(prefix: str, sizes: Sequence[int], stream: np.random.Generator, c
 
 
 def part(parameters: Parameters, prefix: str) -> Parameters:
-    """Return the entries whose names begin with `prefix` and a dot."""
+    """Return the entries whose names begin with `prefix` and a dot, in their order: layer by layer, weight first."""
     return {name: tensor for name, tensor in parameters.items() if name.startswith(f"{prefix}.")}
 
 
@@ -71,7 +71,7 @@ def bank(parameters: Parameters, inputs: Float[Tensor, "steps inputs"]) -> Float
     return outputs
 
 
-def own_states(chosen: Int[Tensor, " steps"], networks: int) -> list[Int[Tensor, " own"]]:
+def own_states(chosen: Int[Tensor, " steps"], networks: int) -> list[Int[Tensor, " _"]]:
     """Return, for each network of a bank, the indices of the steps where it is the chosen one, in their order."""
     order = torch.argsort(chosen, stable=True)
     return list(order.split(torch.bincount(chosen, minlength=networks).tolist()))

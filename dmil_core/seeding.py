@@ -13,7 +13,9 @@ __all__ = ["stream", "stream_seed"]
 
 def stream(seed: int, *name: str | int) -> np.random.Generator:
     """Return the random generator that belongs to `name` under the experiment's `seed`."""
-    digest = hashlib.sha256("\x1f".join(map(repr, name)).encode()).digest()
+    digest = hashlib.sha256(
+        "\x1f".join(repr(part if isinstance(part, str) else int(part)) for part in name).encode()
+    ).digest()
     return np.random.default_rng([seed, *np.frombuffer(digest, dtype=np.uint32).tolist()])
 
 

@@ -27,6 +27,7 @@ FLOORS = {
     "services.checkpoints": 3,
     "services.tracking": 3,
     "services.progress": 3,
+    "services.provenance": 3,
     "services.results": 3,
     "services.rollouts": 4,
     "services.actors": 5,

@@ -1,5 +1,7 @@
 """The dual inner loop: one step by hand, and what it must leave alone."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -7,7 +9,7 @@ from dmil_core.adaptation import adapt, choose, high_level_objective, label, sub
 from dmil_core.losses import Steps
 from dmil_core.networks import Parameters, mlp, part
 
-SETTINGS = {"learning_rate": 0.5, "continuity_weight": 0.3}
+SETTINGS: dict[str, Any] = {"learning_rate": 0.5, "continuity_weight": 0.3}
 
 
 @pytest.fixture

@@ -1,5 +1,8 @@
 """The outer gradient against a plain twin and against finite differences, and the tree that adds gradients."""
 
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
 import pytest
 import torch
 from hypothesis import given
@@ -12,6 +15,7 @@ from dmil_core.meta_gradient import task_gradient, tree_sum
 from dmil_core.networks import Parameters, flatten, unflatten
 
 LENGTHS = ([12, 1, 9], [3, 19], [1, 1, 16, 5], [11, 7])
+Sets: TypeAlias = tuple[Steps, Steps, Steps, Steps]
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
 
 
@@ -57,7 +61,7 @@ class Twin:
         stepped = {n: tensors[n] - self.config.inner_learning_rate * g for n, g in zip(names, gradients, strict=True)}
         return {**tensors, **stepped}
 
-    def __call__(self, parameters: Parameters, sets: list[Steps]) -> tuple[torch.Tensor, float, float]:
+    def __call__(self, parameters: Parameters, sets: Sets) -> tuple[torch.Tensor, float, float]:
         """Return the outer gradient and both outer losses."""
         leaves = {name: tensor.clone().requires_grad_() for name, tensor in parameters.items()}
         tensors = dict(leaves)
@@ -77,9 +81,15 @@ def settings(sub_skills: int, **changes) -> DmilConfig:
     return DmilConfig(**{"sub_skills": sub_skills, "inner_learning_rate": 0.05, "continuity_weight": 0.5, **changes})
 
 
+def draw_sets(make_steps: Callable[..., Steps], dtype: torch.dtype) -> Sets:
+    """Draw τ1 to τ4."""
+    one, two, three, four = (make_steps(seed, lengths, dtype) for seed, lengths in enumerate(LENGTHS))
+    return one, two, three, four
+
+
 @pytest.fixture
-def sets(make_steps) -> list[Steps]:
-    return [make_steps(seed, lengths) for seed, lengths in enumerate(LENGTHS)]
+def sets(make_steps) -> Sets:
+    return draw_sets(make_steps, torch.float64)
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
@@ -91,7 +101,7 @@ def test_equals_the_plain_twin(
 ) -> None:
     config = settings(sub_skills, inner_steps=inner_steps, continuity_weight=continuity_weight, order=order)
     parameters = make_parameters(sub_skills, sub_skills, dtype=dtype)
-    sets = [make_steps(seed, lengths, dtype) for seed, lengths in enumerate(LENGTHS)]
+    sets = draw_sets(make_steps, dtype)
     got = task_gradient(parameters, *sets, config)
     gradient, high, low = Twin(config)(parameters, sets)
     assert got.gradient.dtype == dtype
@@ -104,7 +114,7 @@ def test_equals_the_plain_twin(
 @pytest.mark.parametrize("continuity_weight", [0.0, 0.5])
 @pytest.mark.parametrize("sub_skills", [2, 5])
 def test_equals_the_plain_twin_where_only_the_last_sub_skill_is_used(
-    make_parameters, sets, sub_skills, continuity_weight, order
+    make_parameters, sets: Sets, sub_skills, continuity_weight, order
 ) -> None:
     parameters = make_parameters(0, sub_skills)
     parameters["high.2.bias"][-1] += 8
@@ -119,7 +129,9 @@ def test_equals_the_plain_twin_where_only_the_last_sub_skill_is_used(
 
 @pytest.mark.parametrize("inner_steps", [1, 3])
 @pytest.mark.parametrize("sub_skills", [1, 3])
-def test_second_order_equals_central_differences(make_parameters, sets, sub_skills: int, inner_steps: int) -> None:
+def test_second_order_equals_central_differences(
+    make_parameters, sets: Sets, sub_skills: int, inner_steps: int
+) -> None:
     parameters = make_parameters(3, sub_skills)
     shapes = {name: tensor.shape for name, tensor in parameters.items()}
     origin, generator, step = flatten(parameters), torch.Generator().manual_seed(0), 1e-6
@@ -141,7 +153,7 @@ def test_second_order_equals_central_differences(make_parameters, sets, sub_skil
     assert relative_error(directions @ gradient("first"), differences) > 1e-2
 
 
-def test_orders_agree_as_the_inner_learning_rate_vanishes(make_parameters, sets) -> None:
+def test_orders_agree_as_the_inner_learning_rate_vanishes(make_parameters, sets: Sets) -> None:
     parameters = make_parameters(0, 3)
 
     def gap(learning_rate: float) -> float:
@@ -156,7 +168,7 @@ def test_orders_agree_as_the_inner_learning_rate_vanishes(make_parameters, sets)
 
 
 @pytest.mark.parametrize("order", ["first", "second"])
-def test_is_a_pure_function(make_parameters, sets, order: str) -> None:
+def test_is_a_pure_function(make_parameters, sets: Sets, order: str) -> None:
     parameters = make_parameters(0, 3)
     tensors = [*parameters.values(), *(tensor for steps in sets for tensor in steps)]
     before = [tensor.clone() for tensor in tensors]
@@ -168,7 +180,22 @@ def test_is_a_pure_function(make_parameters, sets, order: str) -> None:
     assert not any(tensor.requires_grad or tensor.grad is not None for tensor in tensors)
 
 
-def test_metrics_say_how_the_sub_skills_are_used(make_parameters, sets) -> None:
+@pytest.mark.parametrize("order", ["first", "second"])
+def test_is_flat_in_the_order_of_the_parameters(make_parameters, sets: Sets, order: str) -> None:
+    parameters = make_parameters(0, 3)
+    low_first = dict(sorted(parameters.items(), key=lambda entry: entry[0].startswith("high")))
+    assert next(iter(low_first)).startswith("low")
+    gradients = [
+        unflatten(
+            task_gradient(given, *sets, settings(3, order=order)).gradient,
+            {name: tensor.shape for name, tensor in given.items()},
+        )
+        for given in (parameters, low_first)
+    ]
+    torch.testing.assert_close(*gradients)
+
+
+def test_metrics_say_how_the_sub_skills_are_used(make_parameters, sets: Sets) -> None:
     metrics = task_gradient(make_parameters(1, 3), *sets, settings(3)).metrics
     shares = [metrics[f"sub_skill_share/{k}"] for k in range(3)]
     assert sum(shares) == pytest.approx(1)
@@ -177,7 +204,7 @@ def test_metrics_say_how_the_sub_skills_are_used(make_parameters, sets) -> None:
     assert 0 <= metrics["continuity_loss"] <= 1
 
 
-def recursive_sum(terms: list[torch.Tensor]) -> torch.Tensor:
+def recursive_sum(terms: Sequence[torch.Tensor]) -> torch.Tensor:
     """Split at the greatest power of two below the length."""
     if len(terms) == 1:
         return terms[0]

@@ -1,6 +1,7 @@
 """The method as the services use it, and that it learns."""
 
 import itertools
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from dmil_core.losses import Steps
 from dmil_core.meta_gradient import tree_sum
 from dmil_core.methods.base import FineTuning
 from dmil_core.methods.dmil import Dmil
-from dmil_core.networks import flatten, mlp, part, unflatten
+from dmil_core.networks import bank, flatten, mlp, part, unflatten
 from dmil_core.seeding import stream
 
 SMALL = DmilConfig(sub_skills=3, hidden_layers=2, hidden_units=8, trajectories=2, window=4, inner_learning_rate=0.05)
@@ -91,6 +92,18 @@ def test_the_chosen_sub_skill_acts(method, demonstrations) -> None:
     assert memory.shape == (len(observations), 0)
 
 
+def test_sub_skill_use_is_the_choice_and_the_best_fit(method, demonstrations) -> None:
+    policy = method.adapt(method.initial_parameters(stream(1, "initial")), demonstrations[:2], FineTuning(2, 0.05))
+    observations, actions = demonstrations[2].observations, demonstrations[2].actions
+    use = policy.sub_skill_use(demonstrations[2])
+    assert np.array_equal(use.chosen, policy.act(observations, policy.start(len(observations))).sub_skills)
+    outputs = bank(part(policy.parameters, "low"), torch.from_numpy(method.standardise(observations))).numpy()
+    assert use.best.tolist() == [
+        int(np.square(outputs[:, t] - actions[t]).sum(1).argmin()) for t in range(len(actions))
+    ]
+    assert len(set(use.best.tolist())) > 1
+
+
 @pytest.mark.parametrize("steps", [0, 3])
 def test_adaptation_leaves_the_parameters(method, demonstrations, steps: int) -> None:
     parameters = method.initial_parameters(stream(0, "initial"))
@@ -124,7 +137,7 @@ def point_mass(task: int, episodes: int, steps: int = 16) -> tuple[list[Demonstr
 
 
 @pytest.mark.parametrize("order", ["first", "second"])
-def test_learns_to_tell_two_skills_apart_in_a_new_task(order: str) -> None:
+def test_learns_to_tell_two_skills_apart_in_a_new_task(order: Literal["first", "second"]) -> None:
     config = DmilConfig(
         sub_skills=2,
         hidden_layers=1,
