@@ -43,7 +43,7 @@ def tasks_of(iteration: int, tasks: Sequence[str], seed: int, slots: int) -> lis
     """Return the task of each slot of an iteration: every task once before any comes again."""
     draw = stream(seed, "tasks", iteration)
     rounds = -(-slots // len(tasks))
-    return [tasks[index] for _ in range(rounds) for index in draw.permutation(len(tasks))][:slots]
+    return [tasks[int(index)] for _ in range(rounds) for index in draw.permutation(len(tasks))][:slots]
 
 
 def groups(training: TrainingConfig) -> list[range]:

@@ -12,10 +12,20 @@ import tyro
 import yaml
 from pydantic import ValidationError
 
-from dmil_core.configs import PRESETS, ExperimentConfig
+from dmil_core.configs import PRESETS, EvaluationConfig, ExperimentConfig
 from dmil_core.errors import UserError
 
-__all__ = ["ConfigError", "Terminated", "config_from", "exit_code", "explain", "main", "parse", "peek"]
+__all__ = [
+    "ConfigError",
+    "Terminated",
+    "config_from",
+    "exit_code",
+    "explain",
+    "main",
+    "parse",
+    "peek",
+    "with_evaluation",
+]
 
 T = TypeVar("T")
 DEFAULT_PRESET = "ml10-quick"
@@ -52,6 +62,15 @@ def config_from(preset: str, file: Path | None) -> ExperimentConfig:
             raise ConfigError(f"--config: got {file} with {type(given).__name__} in it; wanted keys with values")
         _merge(settings, given, str(file), "")
     return _checked(settings)
+
+
+def with_evaluation(config: ExperimentConfig, evaluation: EvaluationConfig) -> ExperimentConfig:
+    """Return `config` with another evaluation.
+
+    Raises:
+        ConfigError: if the two do not go together.
+    """
+    return _checked({**config.model_dump(), "evaluation": evaluation.model_dump()})
 
 
 def _merge(settings: dict[str, Any], given: dict[Any, Any], file: str, prefix: str) -> None:
@@ -93,7 +112,7 @@ def peek(arguments: Sequence[str], **options: Any) -> argparse.Namespace:
     return parser.parse_known_args(arguments)[0]
 
 
-def parse(program: Callable[..., T], description: str, arguments: Sequence[str], defaults: T) -> T:
+def parse(program: type[T], description: str, arguments: Sequence[str], defaults: T) -> T:
     """Read a program's arguments into its dataclass.
 
     Args:
@@ -106,9 +125,7 @@ def parse(program: Callable[..., T], description: str, arguments: Sequence[str],
         ConfigError: for a value that a setting does not allow; what is no flag at all ends with exit code 2.
     """
     try:
-        return tyro.cli(
-            program, args=arguments, description=description, default=defaults, config=(tyro.conf.FlagConversionOff,)
-        )
+        return tyro.cli(program, args=arguments, description=description, default=defaults)
     except ValidationError as error:
         raise ConfigError(explain(error)) from error
 

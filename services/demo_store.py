@@ -55,7 +55,7 @@ class DemoStore:
         """Return the Minari id of a task's demonstrations: other settings, other id."""
         settings = {"horizon": suite.horizon, **config.model_dump(exclude={"held_out"})}
         key = hashlib.sha256(json.dumps([task, settings], sort_keys=True).encode()).hexdigest()[:10]
-        return f"{task}/scripted-{key}-v0"
+        return f"{task}/scripted-{key}-v1"
 
     def load(self, dataset_id: str, task: str) -> TaskDemonstrations | None:
         """Read a task's demonstrations, or `None` if they are not collected yet.

@@ -12,7 +12,7 @@ import tyro
 
 from dmil_core.configs import EvaluationConfig
 from services.checkpoints import Checkpoint, Checkpoints
-from services.command_line import exit_code, parse, peek
+from services.command_line import exit_code, parse, peek, with_evaluation
 from services.demo_store import DemoStore, data_root
 from services.experiment import Experiment, RunnerKind, open_runner
 from services.progress import Clock
@@ -39,14 +39,14 @@ class Arguments:
 
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
-    path = peek(arguments, checkpoint=Path).checkpoint
+    path: Path | None = peek(arguments, checkpoint=Path).checkpoint
     if path is None:
-        parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, EvaluationConfig()))
+        path = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, EvaluationConfig())).checkpoint
     checkpoint = (
         Checkpoints(path / "checkpoints", kept=0).newest() if (path / "checkpoints").is_dir() else Checkpoint(path)
     )
     given = parse(Arguments, __doc__ or "", arguments, Arguments(path, checkpoint.manifest.config.evaluation))
-    config = checkpoint.manifest.config.model_copy(update={"evaluation": given.evaluation})
+    config = with_evaluation(checkpoint.manifest.config, given.evaluation)
     experiment = Experiment(config, DemoStore(data_root()))
     given.output.mkdir(parents=True, exist_ok=True)
     clock = Clock()

@@ -11,6 +11,7 @@ import torch
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError, Standardisation
+from dmil_core.errors import UserError
 from dmil_core.methods.dmil import Dmil
 from dmil_core.networks import Parameters, flatten, unflatten
 from dmil_core.outer_loop import OuterState, tasks_of
@@ -28,7 +29,7 @@ from services.suites.metaworld import MetaWorldSuite
 from services.summary import Evaluation
 from services.tracking import Tracker
 
-__all__ = ["Experiment", "RunnerKind", "open_runner"]
+__all__ = ["Experiment", "NoWorkersError", "RunnerKind", "open_runner"]
 
 RunnerKind = Literal["ray", "local"]
 CHUNK = 10
@@ -37,9 +38,19 @@ PATIENCE = 10
 """So many attempts for each wanted demonstration, then the expert is given up."""
 
 
+class NoWorkersError(UserError):
+    """A number of workers that cannot do any work."""
+
+
 @contextmanager
 def open_runner(kind: RunnerKind, suite: TaskSuite, workers: int | None) -> Iterator[Runner]:
-    """Open a runner and close it in the end, whatever happens."""
+    """Open a runner and close it in the end, whatever happens.
+
+    Raises:
+        NoWorkersError: if there is nobody to work.
+    """
+    if workers is not None and workers < 1:
+        raise NoWorkersError(f"--workers: got {workers}; wanted at least 1; leave it out for one for each CPU")
     runner: Runner = LocalRunner(suite) if kind == "local" else RayRunner(suite, workers)
     try:
         yield runner
@@ -188,7 +199,7 @@ class Experiment:
 
         def save(loss: float | None) -> Path:
             state = runner.state()
-            parameters = unflatten(torch.from_numpy(state.parameters), shapes)
+            parameters = unflatten(torch.tensor(state.parameters), shapes)
             manifest = Manifest(
                 iteration=state.iteration,
                 loss=loss,
@@ -196,7 +207,7 @@ class Experiment:
                 shapes={name: tuple(shape) for name, shape in shapes.items()},
                 data=digests,
                 versions=library_versions(),
-                mlflow_run_id=tracker.run_id,
+                mlflow_run_id=tracker.identify(),
             )
             arrays = {name: tensor.numpy() for name, tensor in parameters.items()}
             return checkpoints.save(state, arrays, method.constants(), manifest)
@@ -296,8 +307,9 @@ def _episode_rows(row: Mapping[str, object], trial: Trial, outcome: TrialOutcome
 
 
 def _adaptation_row(row: Mapping[str, object], outcome: TrialOutcome, sub_skills: int) -> AdaptationResult:
-    chosen = np.concatenate([use.chosen for use in outcome.use])
-    best = np.concatenate([use.best for use in outcome.use])
+    none = np.zeros(0, np.int64)  # where the support set is all that is held out
+    chosen = np.concatenate([none, *(use.chosen for use in outcome.use)])
+    best = np.concatenate([none, *(use.best for use in outcome.use)])
     counts = np.bincount(chosen, minlength=sub_skills)
     return AdaptationResult.model_validate(
         {**row, "steps": len(chosen), "agreeing": int((chosen == best).sum()), "sub_skill_steps": counts.tolist()}

@@ -119,7 +119,7 @@ def _same_run(before: ExperimentConfig, now: ExperimentConfig) -> None:
     """
     old, new = before.model_dump(exclude={"evaluation"}), now.model_dump(exclude={"evaluation"})
     for setting in CHANGEABLE:
-        old["training"].pop(setting), new["training"].pop(setting)
+        del old["training"][setting], new["training"][setting]
     if changed := [section for section in old if old[section] != new[section]]:
         raise ConfigError(
             f"--resume: got other settings of {', '.join(changed)} than the run began with; wanted the same, except "

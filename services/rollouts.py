@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from gymnasium.spaces import Box
 
 from dmil_core.configs import EvaluationConfig
 from dmil_core.demonstrations import Demonstration
@@ -44,7 +45,8 @@ class Episode(NamedTuple):
 def rollout(policy: Policy, envs: Sequence[Environment], seeds: Sequence[int], horizon: int) -> list[Episode]:
     """Run one episode for each seed, each in an environment of its own, with one call of the policy a step for all.
 
-    An episode ends at its first success, or after `horizon` steps without one.
+    An episode ends at its first success, or after `horizon` steps without one; a policy that diverged, so that an
+    action is not finite, fails there and then.
     """
     observations, goals = [], []
     for env, seed in zip(envs, seeds, strict=True):
@@ -57,12 +59,13 @@ def rollout(policy: Policy, envs: Sequence[Environment], seeds: Sequence[int], h
     choices: list[list[int]] = [[] for _ in seeds]
     for _ in range(horizon):
         decision = policy.act(np.asarray(observations, np.float32)[alive], memory)
-        for index, action, sub_skill in zip(alive, decision.actions, decision.sub_skills, strict=True):
-            space = envs[index].action_space
-            observations[index], _, _, _, info = envs[index].step(np.clip(action, space.low, space.high))
+        finite = np.isfinite(decision.actions).all(axis=1)
+        acting = alive[finite].tolist()
+        for index, action, sub_skill in zip(acting, decision.actions[finite], decision.sub_skills[finite], strict=True):
+            observations[index], _, _, _, info = envs[index].step(_clip(action, envs[index]))
             success[index] = info["success"]
             choices[index].append(int(sub_skill))
-        going_on = ~success[alive]
+        going_on = ~success[alive] & finite
         alive, memory = alive[going_on], decision.memory[going_on]
         if not len(alive):
             break
@@ -81,21 +84,27 @@ def demonstrate(
     noise is what is stored, clipped to the action space as the environment clips it.
     """
     disturbance = stream(seed, "expert noise")
-    space = env.action_space
     observation, info = env.reset(seed=seed)
     goal = info["goal"]
     observations, actions = [observation], []
     solved_at, end = None, horizon
     while len(actions) < end:
-        action = np.clip(expert.get_action(observation), space.low, space.high)
+        # A copy: some of Meta-World's experts add offsets to the positions in place.
+        action = _clip(expert.get_action(observation.copy()), env)
         actions.append(action)
-        executed = np.clip(action + disturbance.normal(0, noise, action.shape), space.low, space.high)
+        executed = _clip(action + disturbance.normal(0, noise, action.shape), env)
         observation, _, _, _, info = env.step(executed.astype(np.float32))
         observations.append(observation)
         if info["success"] and solved_at is None:
             solved_at = len(actions) - 1
             end = min(horizon, len(actions) + trailing_steps)
     return Attempt(seed, goal, solved_at, np.asarray(observations, np.float32), np.asarray(actions, np.float32))
+
+
+def _clip(action: np.ndarray, env: Environment) -> np.ndarray:
+    space = env.action_space
+    assert isinstance(space, Box)
+    return np.clip(action, space.low, space.high)
 
 
 def trials(tasks: Sequence[tuple[Split, str]], evaluation: EvaluationConfig) -> list[Trial]:

@@ -1,7 +1,10 @@
 """Where an experiment's work is done: in this process, or by Ray actors; both end with the same bits."""
 
+import logging
 import os
 import secrets
+import signal
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -128,18 +131,21 @@ class RayRunner:
         import ray
 
         self._ray = ray
+        on_termination = signal.getsignal(signal.SIGTERM)
         if "RAY_ADDRESS" in os.environ:
-            ray.init(logging_level="warning")
+            ray.init(logging_level=logging.WARNING)
         else:
             ray.init(
                 address="local",
                 num_cpus=max(os.cpu_count() or 1, workers or 0),
                 include_dashboard=False,
                 object_store_memory=OBJECT_STORE_BYTES,
-                logging_level="warning",
+                logging_level=logging.WARNING,
                 log_to_driver=False,
                 _node_ip_address="127.0.0.1",
             )
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, on_termination)  # Ray puts its own there, which ends at once
         from services.actors.pool import Pool
 
         self._pool = Pool
@@ -172,7 +178,7 @@ class RayRunner:
     ) -> None:
         """Start the learner and the adaptation workers; the demonstrations travel to each node once."""
         self._groups = groups(training)
-        self._learner = self._ray.remote(num_cpus=0)(Learner).remote(state, training)
+        self._learner: Any = self._ray.remote(num_cpus=0)(Learner).remote(state, training)
         self._parameters = self._learner.parameters.remote()
         remote = self._ray.remote(num_cpus=1)(AdaptationWorker)
         shared = self._ray.put(demonstrations)

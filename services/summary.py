@@ -120,7 +120,7 @@ def sub_skill_use(adaptations: Sequence[AdaptationResult]) -> dict[Split, SubSki
     """Return the use of sub-skills in each split."""
     use: dict[Split, SubSkillUse] = {}
     for split in ("meta-training", "meta-testing"):
-        rows = [row for row in adaptations if row.split == split]
+        rows = [row for row in adaptations if row.split == split and row.steps]
         if not rows:
             continue
         steps = np.array([row.sub_skill_steps for row in rows])

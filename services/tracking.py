@@ -56,11 +56,12 @@ class Tracker:
         self._client: MlflowClient | None = None
         self._closing = threading.Event()
         self._complained = False
+        self._answered = threading.Event()
         self._thread = threading.Thread(target=self._work, name="mlflow", daemon=True)
         self._thread.start()
 
     def parameters(self, values: Mapping[str, Any]) -> None:
-        """Record settings; a value is written once and never changes."""
+        """Record settings; MLflow keeps the first value of each, a resumed run's other value becomes a tag."""
         self._record("parameters", {name: str(value) for name, value in values.items()})
 
     def metrics(self, step: int, values: Mapping[str, float]) -> None:
@@ -78,6 +79,11 @@ class Tracker:
     def artifact(self, path: Path, folder: str | None = None) -> None:
         """Record a file or folder as an artifact."""
         self._record("artifact", {"path": str(path.resolve()), "folder": folder})
+
+    def identify(self, patience: float = 20.0) -> str | None:
+        """Return the MLflow run's id; when MLflow was only just asked for it, wait so many seconds for the answer."""
+        self._answered.wait(patience)
+        return self.run_id
 
     def close(self, status: str, patience: float = 60.0) -> bool:
         """End the MLflow run as FINISHED, FAILED or KILLED; return whether all records have been delivered.
@@ -104,6 +110,7 @@ class Tracker:
             try:
                 self._deliver()
             except Exception as error:  # noqa: BLE001  whatever MLflow raises, training goes on
+                self._answered.set()
                 if not self._complained:
                     self._complained = True
                     self._say(
@@ -148,13 +155,17 @@ class Tracker:
             client = MlflowClient(self.uri)
             if self.run_id is None:
                 found = client.get_experiment_by_name(self._experiment)
-                location = None if self.uri.startswith("http") else Path("mlartifacts").resolve().as_uri()
-                experiment_id = found.experiment_id if found else client.create_experiment(self._experiment, location)
+                experiment_id = (
+                    found.experiment_id
+                    if found
+                    else client.create_experiment(self._experiment, artifact_location=_beside(self.uri))
+                )
                 self.run_id = client.create_run(experiment_id, run_name=self._folder.name).info.run_id
                 self._remember()
             else:
                 client.update_run(self.run_id, status="RUNNING")
             self._client = client
+            self._answered.set()
         assert self.run_id is not None
         return self._client, self.run_id
 
@@ -174,8 +185,11 @@ class Tracker:
     def _send_parameters(client: "MlflowClient", run_id: str, values: list[dict[str, str]]) -> None:
         from mlflow.entities import Param
 
-        for part in _parts([Param(name, value) for name, value in values[0].items()], PARAMETERS_PER_CALL):
+        there = client.get_run(run_id).data.params
+        for part in _parts([Param(name, values[0][name]) for name in values[0].keys() - there], PARAMETERS_PER_CALL):
             client.log_batch(run_id, params=part)
+        changed = {f"resumed.{name}": value for name, value in values[0].items() if there.get(name, value) != value}
+        Tracker._send_tags(client, run_id, [changed])
 
     @staticmethod
     def _send_tags(client: "MlflowClient", run_id: str, values: list[dict[str, str]]) -> None:
@@ -205,6 +219,13 @@ def introduce(tracker: Tracker, config: ExperimentConfig) -> None:
     tracker.parameters(dict(_flat(config.model_dump(mode="json"), "")))
     tracker.tags({"suite": config.suite.name, "method": config.method.name, "seed": str(config.seed)})
     tracker.tags({"git_commit": git_commit(), **{f"version.{name}": v for name, v in library_versions().items()}})
+
+
+def _beside(uri: str) -> str | None:
+    """Return where artifacts go: beside an SQLite file, and else where the server says."""
+    if not uri.startswith("sqlite:///"):
+        return None
+    return (Path(uri.removeprefix("sqlite:///")).resolve().parent / "mlartifacts").as_uri()
 
 
 def _flat(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:

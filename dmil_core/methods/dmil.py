@@ -86,8 +86,10 @@ class Dmil:
 
     def task_gradient(self, parameters: Parameters, material: TaskBatch) -> TaskGradient:
         """Return the outer gradient of Algorithm 1 for one task."""
-        sets = (Steps.of(demonstrations, self.standardise) for demonstrations in material.sets)
-        return meta_gradient.task_gradient(parameters, *sets, self.config)
+        support_high, support_low, query_high, query_low = (
+            Steps.of(demonstrations, self.standardise) for demonstrations in material.sets
+        )
+        return meta_gradient.task_gradient(parameters, support_high, support_low, query_high, query_low, self.config)
 
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> DmilPolicy:
         """Run the dual inner loop with the support set as both τ1 and τ2."""

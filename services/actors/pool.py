@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import ray
-from ray.actor import ActorHandle
 from ray.exceptions import ActorDiedError, ActorUnavailableError, GetTimeoutError
 
 from dmil_core.errors import UserError
@@ -21,7 +20,7 @@ class NoRoomError(UserError):
 class Pool:
     """Stateless actors of one kind. A call whose actor dies is made again on its replacement."""
 
-    def __init__(self, make: Callable[[], ActorHandle], size: int) -> None:
+    def __init__(self, make: Callable[[], Any], size: int) -> None:
         """Start `size` actors and wait until all are up.
 
         Raises:
@@ -64,6 +63,7 @@ class Pool:
             try:
                 first = ray.get(done)
             except (ActorDiedError, ActorUnavailableError):
+                ray.kill(self._actors[slot])  # one that is only out of reach would keep its place
                 self._actors[slot] = self._make()
                 self.restarts += 1
                 waiting.append(call)

@@ -1,0 +1,219 @@
+"""What the tests of the service share: one small store of demonstrations, one Ray cluster, and the programs."""
+
+import os
+import secrets
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from dmil_core.configs import PRESETS, ExperimentConfig
+from services import meta_train
+from services.checkpoints import Checkpoint, Checkpoints
+from services.command_line import exit_code
+from services.demo_store import DemoStore, TaskDemonstrations
+from services.experiment import Experiment, open_runner
+
+# Ray reads these when it is first imported, after this file, here and in every program that a test starts.
+os.environ |= {
+    "RAY_AUTH_MODE": "token",
+    "RAY_AUTH_TOKEN": secrets.token_hex(32),
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "OMP_NUM_THREADS": "1",
+}
+for _name in ("RAY_ADDRESS", "MLFLOW_TRACKING_URI", "MLFLOW_RUN_ID", "MLFLOW_EXPERIMENT_NAME", "DMIL_DATA"):
+    os.environ.pop(_name, None)
+
+PROJECT = Path(__file__).parents[2]
+SECONDS_TO_START = 90
+
+
+@pytest.fixture(scope="session")
+def config() -> ExperimentConfig:
+    """Three tasks to train on and one to test on, tiny networks."""
+    return PRESETS["ml10-smoke"]
+
+
+@pytest.fixture(scope="session")
+def store(config: ExperimentConfig, tmp_path_factory: pytest.TempPathFactory) -> DemoStore:
+    """The demonstrations of `config`, collected once."""
+    store = DemoStore(tmp_path_factory.mktemp("data"))
+    experiment = Experiment(config, store)
+    with open_runner("local", experiment.suite, None) as runner:
+        experiment.collect(runner)
+    return store
+
+
+@pytest.fixture(scope="session")
+def experiment(config: ExperimentConfig, store: DemoStore) -> Experiment:
+    return Experiment(config, store)
+
+
+@pytest.fixture(scope="session")
+def data(experiment: Experiment) -> dict[str, TaskDemonstrations]:
+    with open_runner("local", experiment.suite, None) as runner:
+        return experiment.collect(runner)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.fixture(scope="session", name="free_port")
+def free_port_fixture() -> Callable[[], int]:
+    """Returns a port of the loopback interface that nothing listens on."""
+    return free_port
+
+
+def wait_for(condition: Callable[[], bool], what: str, seconds: float = SECONDS_TO_START) -> None:
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until, f"{what}: not within {seconds} s"
+        time.sleep(0.1)
+
+
+@pytest.fixture(scope="session", name="wait_for")
+def wait_for_fixture() -> Callable[..., None]:
+    """Waits until a condition holds, and fails if it does not come to hold."""
+    return wait_for
+
+
+def answers(url: str) -> bool:
+    """Tell whether a server answers with anything at all."""
+    try:
+        urllib.request.urlopen(url, timeout=5).close()
+    except urllib.error.HTTPError:
+        return True
+    except OSError:
+        return False
+    return True
+
+
+@pytest.fixture(scope="session", name="answers")
+def answers_fixture() -> Callable[[str], bool]:
+    return answers
+
+
+class Cluster(NamedTuple):
+    """A Ray cluster on loopback, started from the project's root as a user would."""
+
+    address: str
+    dashboard: str
+
+
+@pytest.fixture(scope="session")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    """One `ray start --head` for the whole session, with room for three workers."""
+    port, dashboard_port = free_port(), free_port()
+    folder = tempfile.mkdtemp(prefix="dmil")  # Ray's sockets lie in it: a path of over 107 bytes is too long
+    log = tmp_path_factory.mktemp("ray") / "head.log"
+    command = [
+        sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block", "--num-cpus=3",
+        "--node-ip-address=127.0.0.1", f"--port={port}", "--dashboard-host=127.0.0.1",
+        f"--dashboard-port={dashboard_port}", "--include-dashboard=true", f"--temp-dir={folder}",
+        "--object-store-memory=200000000", "--disable-usage-stats",
+    ]  # fmt: skip
+    with log.open("w") as output:
+        head = subprocess.Popen(command, cwd=PROJECT, stdout=output, stderr=output)
+    try:
+        wait_for(
+            lambda: answers(f"http://127.0.0.1:{dashboard_port}/api/version") or head.poll() is not None, "ray start"
+        )
+        assert head.poll() is None, log.read_text()
+        yield Cluster(f"127.0.0.1:{port}", f"http://127.0.0.1:{dashboard_port}")
+    finally:
+        head.send_signal(signal.SIGTERM)
+        head.wait(30)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture
+def joined(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> Cluster:
+    """Ray runners of this test join the session's cluster."""
+    monkeypatch.setenv("RAY_ADDRESS", cluster.address)
+    return cluster
+
+
+@pytest.fixture(scope="session")
+def mlflow_file(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The address of an SQLite file, whose tables are made once."""
+    return f"sqlite:///{tmp_path_factory.mktemp('mlflow') / 'mlflow.db'}"
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, store: DemoStore, mlflow_file: str, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory of the test's own, where programs find the demonstrations collected already."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DMIL_DATA", str(store.root))
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", mlflow_file)
+    return tmp_path
+
+
+class Programs:
+    """Starts programs as a user does, in the test's working directory and environment."""
+
+    def start(self, name: str, *arguments: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", f"services.{name}", *arguments]
+        return subprocess.Popen(
+            command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True
+        )
+
+    def __call__(self, name: str, *arguments: str) -> tuple[int, str]:
+        """Run a program to its end; return its exit code, and what it printed."""
+        program = self.start(name, *arguments)
+        printed, _ = program.communicate(timeout=240)
+        return program.returncode, printed
+
+
+@pytest.fixture
+def programs(workplace: Path) -> Programs:
+    return Programs()
+
+
+QUICK_EVALUATION = ("--evaluation.shots", "1", "--evaluation.episodes", "1", "--evaluation.fine-tuning-steps", "1")
+
+
+@pytest.fixture
+def train(workplace: Path) -> Callable[..., Checkpoint]:
+    """Meta-trains in this process, and returns the newest checkpoint of the run `name`."""
+
+    def run(name: str, *arguments: str, resume: bool = False) -> Checkpoint:
+        which = ["--resume", name] if resume else ["--preset", "ml10-smoke", "--name", name]
+        runner = [] if "--runner" in arguments else ["--runner", "local"]
+        meta_train.run([*which, *runner, *QUICK_EVALUATION, *arguments])
+        return Checkpoints(workplace / "runs" / name / "checkpoints", kept=1).newest()
+
+    return run
+
+
+@pytest.fixture
+def complaint(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Runs a program in this process on a mistake, which ends with exit code 2, and returns what it says."""
+
+    def say(program: Callable[[Sequence[str]], None], *arguments: str) -> str:
+        capsys.readouterr()
+        before = signal.getsignal(signal.SIGTERM)
+        try:
+            code = exit_code(program, arguments)
+        except SystemExit as end:
+            code = end.code
+        finally:
+            signal.signal(signal.SIGTERM, before)
+        assert code == 2
+        return "".join(capsys.readouterr())
+
+    return say

@@ -1,0 +1,71 @@
+"""Evaluation on its own: the rows that the run itself found, other shots by flag, and damage reported by file."""
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from services import evaluate
+
+
+@pytest.fixture
+def trained(train, workplace: Path) -> Path:
+    train("run", "--training.iterations", "3")
+    return workplace / "runs" / "run"
+
+
+def test_it_finds_what_the_run_itself_found(programs, trained: Path):
+    code, printed = programs("evaluate", "--checkpoint", "runs/run", "--output", "again", "--runner", "local")
+    assert code == 0, printed
+    for name in ("episodes.jsonl", "adaptations.jsonl"):
+        assert Path("again", name).read_bytes() == (trained / name).read_bytes()
+    again, before = (json.loads(Path(folder, "summary.json").read_text()) for folder in ("again", "runs/run"))
+    for key in ("rows", "sub_skills", "checkpoint_digest", "protocol", "seed"):
+        assert again[key] == before[key]
+    assert Path("again/report/table.md").read_text() == (trained / "report" / "table.md").read_text()
+
+
+@pytest.mark.usefixtures("trained")
+def test_settings_of_the_evaluation_may_differ():
+    flags = ["--evaluation.shots", "2", "4", "--evaluation.episodes", "2", "--evaluation.fine-tuning-steps", "3"]
+    evaluate.run(["--checkpoint", "runs/run/checkpoints/iteration-0000003", "--runner", "local", *flags])
+    rows = [json.loads(line) for line in Path("evaluation/episodes.jsonl").read_text().splitlines()]
+    assert Counter((row["shots"], len(row["support"])) for row in rows) == {(2, 2): 8, (4, 4): 8}
+    assert {row["fine_tuning_steps"] for row in rows} == {3}
+
+
+@pytest.mark.usefixtures("trained")
+def test_a_second_evaluation_replaces_the_rows_of_the_first():
+    for _ in range(2):
+        evaluate.run(["--checkpoint", "runs/run", "--runner", "local"])
+    assert len(Path("evaluation/episodes.jsonl").read_text().splitlines()) == 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--checkpoint", "nowhere"), ("nowhere/manifest.json",)),
+        (("--checkpoint", "runs/run"), ("iteration-0000003/parameters.safetensors", "SHA-256")),
+        (("--checkpoint", "runs/run", "--evaluation.shots", "5"), ("held_out", "got 4", "wanted at least 5")),
+        (
+            ("--checkpoint", "runs/run", "--evaluation.episodes", "0"),
+            ("episodes", "input_value=0", "greater than or equal to 1"),
+        ),
+        ((), ("--checkpoint",)),
+    ],
+    ids=["missing", "damaged", "more shots than held out", "no episode", "not given"],
+)
+def test_a_mistake_is_answered_with_what_is_allowed(complaint, trained: Path, arguments, words):
+    if "parameters.safetensors" in words[0]:
+        (trained / "checkpoints" / "iteration-0000003" / "parameters.safetensors").write_bytes(b"")
+    printed = complaint(evaluate.run, *arguments)
+    assert all(word in printed for word in words), printed
+
+
+@pytest.mark.usefixtures("workplace")
+def test_a_mistake_ends_the_program_with_exit_code_2(programs):
+    code, printed = programs("evaluate", "--checkpoint", "nowhere")
+    assert code == 2
+    assert "error: nowhere/manifest.json: got " in printed
+    assert "Traceback" not in printed

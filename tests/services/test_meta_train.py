@@ -1,0 +1,232 @@
+"""The main program from end to end: what it leaves behind, and that stopping and going on changes no bit."""
+
+import json
+import os
+import signal
+from collections import Counter
+from pathlib import Path
+
+import minari
+import numpy as np
+import psutil
+import pytest
+from mlflow import MlflowClient
+
+from services import meta_train
+from services.checkpoints import Checkpoint, Checkpoints
+from services.command_line import ConfigError
+from services.results import EpisodeResult
+
+LOSSES = {"high_loss_before", "high_loss_after", "low_loss_before", "low_loss_after", "continuity_loss"}
+
+
+def same(one: Checkpoint, other: Checkpoint) -> bool:
+    """Tell whether two checkpoints hold the same bits."""
+    return one.state.iteration == other.state.iteration and all(map(np.array_equal, one.state[1:], other.state[1:]))
+
+
+def rows(folder: Path) -> list[EpisodeResult]:
+    return [EpisodeResult.model_validate_json(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
+
+
+def test_a_run_from_end_to_end(programs, workplace: Path, data, mlflow_file: str):
+    code, printed = programs("meta_train", "--preset", "ml10-smoke", "--runner", "local", "--name", "whole")
+    assert code == 0, printed
+    folder = workplace / "runs" / "whole"
+
+    summary = json.loads((folder / "summary.json").read_text())
+    assert {"collect", "train", "evaluate", "total"} <= set(summary["seconds"])
+    assert [(row["split"], row["shots"], row["episodes"]) for row in summary["rows"]] == [
+        ("meta-training", 1, 6),
+        ("meta-training", 3, 6),
+        ("meta-testing", 1, 2),
+        ("meta-testing", 3, 2),
+    ]
+    for row in summary["rows"]:
+        assert row["low"] <= row["success_rate"] <= row["high"]
+        assert np.isclose(np.mean(list(row["per_task"].values())), row["success_rate"])
+    assert set(summary["sub_skills"]) == {"meta-training", "meta-testing"}
+    for use in summary["sub_skills"].values():
+        assert np.isclose(sum(use["share"]), 1)
+        assert 0 <= use["agreement"] <= 1
+
+    for row in summary["rows"]:
+        successes = f"{round(row['success_rate'] * row['episodes'])}/{row['episodes']}"
+        assert any(row["split"] in line and successes in line for line in printed.splitlines())
+    for place in ("checkpoint: runs/whole/checkpoints/iteration-0000020", "report: runs/whole/report"):
+        assert place in printed
+    assert f"MLflow run: {summary['mlflow_run_id']} at {mlflow_file}" in printed
+    assert "mlflow ui --backend-store-uri" in printed
+    assert "meta-training 20/20" in printed
+    assert (folder / "report" / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert "drawer-close" in (folder / "report" / "table.md").read_text()
+
+    checkpoint = Checkpoint(folder / "checkpoints" / "iteration-0000020")
+    assert checkpoint.digest == summary["checkpoint_digest"]
+    assert checkpoint.manifest.mlflow_run_id == summary["mlflow_run_id"]
+    assert checkpoint.manifest.data == {task: dataset.digest for task, dataset in data.items()}
+
+    episodes = rows(folder)
+    assert Counter(row.checkpoint for row in episodes) == {checkpoint.digest: 16}
+    held_out = {f"{index:03d}" for index in range(8, 12)}
+    for row in episodes:
+        assert set(row.support) <= held_out
+        assert len(row.support) == row.shots
+
+    client = MlflowClient(mlflow_file)
+    run = client.get_run(summary["mlflow_run_id"])
+    assert run.info.status == "FINISHED"
+    assert run.data.params["method.sub_skills"] == "3"
+    assert run.data.params["suite.test_tasks"] == "['door-close']"
+    assert set(run.data.params) >= {"seed", "training.iterations", "demonstrations.noise", "evaluation.shots"}
+    assert {"git_commit", "version.torch", "version.ray", "version.mujoco"} <= set(run.data.tags)
+    assert run.inputs is not None
+    inputs = {entry.dataset.name: entry.dataset.digest for entry in run.inputs.dataset_inputs}
+    assert inputs == {dataset.id: dataset.digest[:32] for dataset in data.values()}
+    shares = {f"sub_skill_share/{index}" for index in range(3)}
+    for name in LOSSES | shares | {"sub_skill_entropy", "gradient_norm", "iterations_per_second"}:
+        assert [point.step for point in client.get_metric_history(run.info.run_id, name)] == list(range(1, 21)), name
+    for row in summary["rows"]:
+        name = f"{row['split']}/{row['shots']}-shot"
+        assert run.data.metrics[f"success_rate/{name}"] == row["success_rate"]
+        assert run.data.metrics[f"success_rate_low/{name}"] == row["low"]
+        assert run.data.metrics[f"episodes/{name}"] == row["episodes"]
+        for task, rate in row["per_task"].items():
+            assert run.data.metrics[f"task_success_rate/{name}/{task}"] == rate
+    folders = (None, "report", "checkpoint")
+    artifacts = {entry.path for path in folders for entry in client.list_artifacts(run.info.run_id, path)}
+    assert artifacts >= {
+        "summary.json", "episodes.jsonl", "report/table.md", "report/curves.png", "checkpoint/manifest.json",
+        "checkpoint/parameters.safetensors", "checkpoint/optimiser.safetensors",
+    }  # fmt: skip
+
+
+def test_episodes_start_from_goals_that_no_demonstration_holds(workplace: Path, train, store, monkeypatch):
+    train("run", "--training.iterations", "0", "--evaluation.episodes", "4", "--evaluation.shots", "1")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(store.root))
+    episodes = rows(workplace / "runs" / "run")
+    for name in minari.list_local_datasets():
+        task = name.partition("/")[0]
+        kept = minari.load_dataset(name).storage.get_episode_metadata(range(12))
+        demonstrated = {tuple(episode["options"]["goal"]) for episode in kept}
+        evaluated = {row.goal for row in episodes if row.task == task}
+        assert len(demonstrated) == 12
+        assert len(evaluated) == 4
+        assert demonstrated.isdisjoint(evaluated)
+
+
+def test_going_on_ends_with_the_same_bits(workplace: Path, train, mlflow_file: str):
+    undisturbed = train("whole", "--training.iterations", "7")
+    half = train("parts", "--training.iterations", "4")
+    resumed = train("parts", "--training.iterations", "7", resume=True)
+    assert half.manifest.iteration == 4
+    assert same(resumed, undisturbed)
+    assert resumed.manifest.mlflow_run_id == half.manifest.mlflow_run_id != undisturbed.manifest.mlflow_run_id
+    client = MlflowClient(mlflow_file)
+    history = client.get_metric_history(str(half.manifest.mlflow_run_id), "gradient_norm")
+    assert [point.step for point in history] == list(range(1, 8))
+    assert client.get_run(str(half.manifest.mlflow_run_id)).info.status == "FINISHED"
+    assert rows(workplace / "runs" / "parts")[0].success == rows(workplace / "runs" / "whole")[0].success
+
+
+def test_a_run_that_was_stopped_before_its_first_checkpoint_begins_anew(workplace: Path, train):
+    undisturbed = train("whole", "--training.iterations", "3")
+    train("other", "--training.iterations", "3")
+    for path in Checkpoints(workplace / "runs" / "other" / "checkpoints", 3).all():
+        path.rename(path.with_name(".writing-1"))
+    assert same(train("other", resume=True), undisturbed)
+
+
+@pytest.mark.parametrize(
+    ("flag", "section"),
+    [
+        (("--method.sub-skills", "4"), "method"),
+        (("--seed", "1"), "seed"),
+        (("--training.learning-rate", "0.5"), "training"),
+        (("--demonstrations.held-out", "5"), "demonstrations"),
+    ],
+)
+def test_going_on_with_other_settings_is_refused(train, flag: tuple[str, str], section: str):
+    train("run", "--training.iterations", "0")
+    with pytest.raises(ConfigError, match=f"--resume: got other settings of {section} than the run began with"):
+        train("run", *flag, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--resume", "nowhere"), ("--resume: got 'nowhere'", "in runs")),
+        (("--preset", "ml10-smoke", "--name", "run"), ("--name: got runs/run", "--resume runs/run")),
+    ],
+    ids=["no such run", "a name that is taken"],
+)
+def test_a_run_that_cannot_be_is_refused(train, complaint, arguments, words):
+    train("run", "--training.iterations", "0")
+    printed = complaint(meta_train.run, *arguments)
+    assert all(word in printed for word in words), printed
+
+
+def test_a_refusal_ends_the_program_with_exit_code_2(programs, train):
+    train("run", "--training.iterations", "0")
+    code, printed = programs("meta_train", "--resume", "run", "--method.sub-skills", "4")
+    assert code == 2
+    assert "error: --resume: got other settings of method" in printed
+    assert "Traceback" not in printed
+
+
+def descendants(session: str) -> list[psutil.Process]:
+    """Return every process that a program started, also those whose parent is gone."""
+    found = []
+    for process in psutil.process_iter():
+        try:
+            mine = process.environ().get("DMIL_TEST_SESSION") == session
+            if mine and process.status() != psutil.STATUS_ZOMBIE:
+                found.append(process)
+        except psutil.Error:
+            continue
+    return found
+
+
+@pytest.mark.parametrize(
+    ("runner", "number", "wanted"),
+    [
+        ("local", signal.SIGINT, 130),
+        ("local", signal.SIGTERM, 143),
+        pytest.param("ray", signal.SIGINT, 130, marks=pytest.mark.slow),
+        pytest.param("ray", signal.SIGTERM, 143, marks=pytest.mark.slow),
+    ],
+)
+def test_a_stopped_run_goes_on_with_the_same_bits(
+    programs, train, wait_for, mlflow_file, workplace: Path, monkeypatch, runner: str, number: int, wanted: int
+):
+    session = f"{runner}-{wanted}-{os.getpid()}"
+    monkeypatch.setenv("DMIL_TEST_SESSION", session)
+    arguments = ("--preset", "ml10-smoke", "--runner", runner, "--name", "run", "--training.checkpoint-every", "5")
+    program = programs.start("meta_train", *arguments, "--training.iterations", "100000")
+    checkpoints = Checkpoints(workplace / "runs" / "run" / "checkpoints", 3)
+    wait_for(lambda: bool(checkpoints.all()) or program.poll() is not None, "the first checkpoint")
+    (os.killpg if number == signal.SIGINT else os.kill)(program.pid, number)
+    printed, _ = program.communicate(timeout=60)
+    assert program.returncode == wanted, printed
+    assert "stopped; to go on: python -m services.meta_train --resume runs/run" in printed
+    assert "Traceback" not in printed
+    monkeypatch.delenv("DMIL_TEST_SESSION")
+    wait_for(lambda: not descendants(session), f"the end of {descendants(session)}", 15)
+
+    stopped = checkpoints.newest()
+    mlflow_run = json.loads((workplace / "runs" / "run" / "mlflow_run.json").read_text())["run_id"]
+    assert MlflowClient(mlflow_file).get_run(mlflow_run).info.status == "KILLED"
+    until = str(stopped.manifest.iteration + 3)
+    resumed = train("run", "--training.iterations", until, resume=True)
+    undisturbed = train("undisturbed", "--training.iterations", until)
+    assert same(resumed, undisturbed)
+    assert resumed.manifest.mlflow_run_id == mlflow_run
+
+
+def test_other_demonstrations_than_it_was_trained_on_are_refused(complaint, train):
+    manifest = train("run", "--training.iterations", "1").path / "manifest.json"
+    was = json.loads(manifest.read_text())
+    manifest.write_text(json.dumps(was | {"data": was["data"] | {"push": "0" * 64}}))
+    printed = complaint(meta_train.run, "--resume", "run", "--training.iterations", "2", "--runner", "local")
+    assert "trained on other demonstrations of push" in printed
+    assert "DMIL_DATA" in printed
