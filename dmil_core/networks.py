@@ -17,10 +17,15 @@ from torch.nn import functional
 __all__ = ["Parameters", "bank", "bank_each", "flatten", "initialise", "mlp", "own_states", "part", "unflatten"]
 
 Parameters: TypeAlias = Mapping[str, Tensor]
+OUTPUT_GAIN = 0.07
+"""Scale of the output layer's first weights, against He's."""
 
 
 def initialise(prefix: str, sizes: Sequence[int], stream: np.random.Generator, copies: int | None = None) -> Parameters:
-    """Draw the parameters of a perceptron: He-uniform weights (He et al. 2015), a small output layer, zero biases.
+    """Draw the parameters of a perceptron: He-uniform weights (He et al. 2015), a tiny output layer, zero biases.
+
+    With a tiny output layer all sub-skills begin nearly equal, so the first labels spread over all of them; with a
+    common one a sub-skill that happens to begin worse than another is never chosen, and stays behind.
 
     Args:
         prefix: what the names begin with: ``{prefix}.{layer}.weight`` and ``{prefix}.{layer}.bias``.
@@ -32,7 +37,7 @@ def initialise(prefix: str, sizes: Sequence[int], stream: np.random.Generator, c
     batch = () if copies is None else (copies,)
     parameters: dict[str, Tensor] = {}
     for layer, (fan_in, fan_out) in enumerate(itertools.pairwise(sizes)):
-        bound = (6 / fan_in) ** 0.5 if layer < len(sizes) - 2 else (3 / fan_in) ** 0.5
+        bound = (6 / fan_in) ** 0.5 * (1 if layer < len(sizes) - 2 else OUTPUT_GAIN)
         weight = torch.rand(*batch, fan_out, fan_in, generator=generator)
         parameters[f"{prefix}.{layer}.weight"] = (2 * weight - 1) * bound
         parameters[f"{prefix}.{layer}.bias"] = torch.zeros(*batch, fan_out)

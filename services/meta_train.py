@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from pydantic import ValidationError
 
 from dmil_core.configs import ExperimentConfig
 from services.checkpoints import Checkpoint, CheckpointError, Checkpoints
-from services.command_line import DEFAULT_PRESET, ConfigError, config_from, exit_code, parse, peek
+from services.command_line import DEFAULT_PRESET, ConfigError, config_from, exit_code, explain, parse, peek
 from services.demo_store import DemoStore, data_root
 from services.experiment import Experiment, RunnerKind, open_runner
 from services.progress import Clock, console
@@ -96,8 +97,15 @@ def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]
         if (folder / "config.json").exists():
             raise ConfigError(f"--name: got {folder}, which holds a run; wanted a new name, or --resume {folder}")
         return given, folder, None
+    if early.preset or early.config:
+        raise ConfigError(
+            "--resume: got --preset or --config with it; wanted neither: a run goes on with its own settings"
+        )
     folder = _find_run(early.resume, early.runs or Arguments.runs)
-    before = ExperimentConfig.model_validate_json((folder / "config.json").read_text())
+    try:
+        before = ExperimentConfig.model_validate_json((folder / "config.json").read_bytes())
+    except ValidationError as error:
+        raise ConfigError(f"{folder / 'config.json'}: {explain(error)}; start a new run") from error
     given = parse(Arguments, __doc__ or "", arguments, Arguments(before))
     _same_run(before, given.experiment)
     saved = Checkpoints(folder / "checkpoints", given.experiment.training.checkpoints_kept)

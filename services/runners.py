@@ -6,6 +6,7 @@ import secrets
 import signal
 import threading
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, Protocol
 
 import torch
@@ -102,7 +103,8 @@ class LocalRunner:
     def iterate(self, iteration: int, tasks: Sequence[str]) -> tuple[list[Mapping[str, float]], float]:
         """Compute the groups one after the other."""
         results = [self._worker.gradient(self._parameters, iteration, tasks, slots) for slots in self._groups]
-        norm, self._parameters = self._learner.step(*(gradient for _, gradient in results))
+        with _undisturbed():
+            norm, self._parameters = self._learner.step(*(gradient for _, gradient in results))
         return [metrics for group, _ in results for metrics in group], norm
 
     def state(self) -> OuterState:
@@ -209,6 +211,26 @@ class RayRunner:
     def close(self) -> None:
         """Leave the cluster; one that was started here ends."""
         self._ray.shutdown()
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM wait: a step of Adam cut in the middle is no state to go on from."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    waiting: list[int] = []
+    before = {
+        number: signal.signal(number, lambda number, frame: waiting.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in waiting:
+            signal.raise_signal(number)
 
 
 def _secure_local_cluster() -> None:

@@ -49,6 +49,7 @@ class Tracker:
         """
         self.uri = tracking_uri()
         self._folder, self._experiment, self._say = folder, experiment, say
+        _drop_half_line(folder / "tracking.jsonl")
         self._spool = (folder / "tracking.jsonl").open("a", buffering=1)
         self._identity = folder / "mlflow_run.json"
         self._offset = json.loads(self._identity.read_text())["delivered"] if self._identity.exists() else 0
@@ -219,6 +220,13 @@ def introduce(tracker: Tracker, config: ExperimentConfig) -> None:
     tracker.parameters(dict(_flat(config.model_dump(mode="json"), "")))
     tracker.tags({"suite": config.suite.name, "method": config.method.name, "seed": str(config.seed)})
     tracker.tags({"git_commit": git_commit(), **{f"version.{name}": v for name, v in library_versions().items()}})
+
+
+def _drop_half_line(path: Path) -> None:
+    """Cut off a last line that a killed process did not finish."""
+    if path.exists():
+        whole = path.read_bytes().rpartition(b"\n")
+        os.truncate(path, len(whole[0] + whole[1]))
 
 
 def _beside(uri: str) -> str | None:

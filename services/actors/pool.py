@@ -1,5 +1,6 @@
 """Keeps a pool of actors busy and alive; knows nothing of their work."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -11,6 +12,8 @@ from dmil_core.errors import UserError
 __all__ = ["NoRoomError", "Pool"]
 
 PLACEMENT_SECONDS = 120
+DEATHS_ALLOWED = 3
+"""A call that ends so many actors is given up: it is the call that kills them."""
 
 
 class NoRoomError(UserError):
@@ -47,9 +50,13 @@ class Pool:
 
         With more than one of `returns`, the first is fetched and the others stay object references: a result is
         then a tuple.
+
+        Raises:
+            ActorDiedError: if a call ends three actors one after the other.
         """
         waiting = list(reversed(range(len(calls))))
         idle = list(range(len(self._actors)))
+        deaths: Counter[int] = Counter()
         running: dict[ray.ObjectRef, tuple[int, int, list[ray.ObjectRef]]] = {}
         while waiting or running:
             while waiting and idle:
@@ -66,6 +73,9 @@ class Pool:
                 ray.kill(self._actors[slot])  # one that is only out of reach would keep its place
                 self._actors[slot] = self._make()
                 self.restarts += 1
+                deaths[call] += 1
+                if deaths[call] == DEATHS_ALLOWED:
+                    raise
                 waiting.append(call)
             else:
                 yield call, first if returns == 1 else (first, *refs[1:])
