@@ -158,7 +158,7 @@ PRESETS: dict[str, ExperimentConfig] = {
             window=24,
         ),
         training=TrainingConfig(
-            iterations=4000, slots_per_group=5, learning_rate=1e-3, gradient_clip=10.0, checkpoint_every=500
+            iterations=4000, slots_per_group=5, learning_rate=5e-4, gradient_clip=10.0, checkpoint_every=500
         ),
         evaluation=EvaluationConfig(learning_rate=3e-3),
     ),

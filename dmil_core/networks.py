@@ -17,7 +17,7 @@ from torch.nn import functional
 __all__ = ["Parameters", "bank", "bank_each", "flatten", "initialise", "mlp", "own_states", "part", "unflatten"]
 
 Parameters: TypeAlias = Mapping[str, Tensor]
-OUTPUT_GAIN = 0.07
+OUTPUT_GAIN = 0.005
 """Scale of the output layer's first weights, against He's."""
 
 

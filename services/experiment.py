@@ -223,19 +223,10 @@ class Experiment:
                     began = time.perf_counter()
                     tasks = tasks_of(iteration, self.suite.train_tasks, self.config.seed, training.tasks_per_iteration)
                     slots, norm = runner.iterate(iteration, tasks)
-                    metrics = {name: float(np.mean([slot[name] for slot in slots])) for name in slots[0]}
-                    shares = np.array([metrics[f"sub_skill_share/{k}"] for k in range(method.sub_skills)])
-                    metrics["sub_skill_entropy"] = share_entropy(shares)
-                    metrics["gradient_norm"] = norm
-                    metrics["iterations_per_second"] = 1 / (time.perf_counter() - began)
+                    metrics = _iteration_metrics(slots, norm, time.perf_counter() - began)
                     tracker.metrics(iteration + 1, metrics)
                     losses.append(metrics["high_loss_after"] + metrics["low_loss_after"])
-                    bar.advance(
-                        1,
-                        f"losses {metrics['high_loss_after']:.3f} high, {metrics['low_loss_after']:.3f} low; "
-                        f"sub-skills in use {(shares > 0.01).sum()}/{method.sub_skills}; "
-                        f"{metrics['iterations_per_second']:.1f} iterations/s",
-                    )
+                    bar.advance(1, _in_words(metrics))
                     if (iteration + 1) % training.checkpoint_every == 0 or iteration + 1 == training.iterations:
                         path = save(float(np.mean(losses)))
                         losses.clear()
@@ -297,6 +288,26 @@ class Experiment:
             write_rows(folder / name, rows)
         failed = {task: dataset.failed for task, dataset in data.items()}
         return Evaluation(checkpoint, self.suite.protocol, failed, episodes, adaptations)
+
+
+def _iteration_metrics(slots: Sequence[Mapping[str, float]], norm: float, seconds: float) -> dict[str, float]:
+    """Return an iteration's metrics: the means over its slots, and what they say together."""
+    metrics = {name: float(np.mean([slot[name] for slot in slots])) for name in slots[0]}
+    entropy = share_entropy(_shares(metrics))
+    return metrics | {"sub_skill_entropy": entropy, "gradient_norm": norm, "iterations_per_second": 1 / seconds}
+
+
+def _shares(metrics: Mapping[str, float]) -> np.ndarray:
+    return np.array([share for name, share in metrics.items() if name.startswith("sub_skill_share/")])
+
+
+def _in_words(metrics: Mapping[str, float]) -> str:
+    shares = _shares(metrics)
+    return (
+        f"losses {metrics['high_loss_after']:.3f} high, {metrics['low_loss_after']:.3f} low; "
+        f"sub-skills in use {(shares > 0.01).sum()}/{len(shares)}; "
+        f"{metrics['iterations_per_second']:.1f} iterations/s"
+    )
 
 
 def _episode_rows(row: Mapping[str, object], trial: Trial, outcome: TrialOutcome) -> list[EpisodeResult]:
