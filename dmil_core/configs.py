@@ -73,6 +73,8 @@ class DmilConfig(Settings):
     """Layers of ReLU units in each network (F.2)."""
     hidden_units: Count = 512
     """Units in each hidden layer (F.2)."""
+    output_scale: Positive = 1.0
+    """Scale of the output layers' first weights, against He's; the paper names no initialisation."""
     standardise: bool = True
     """Standardise observations by the statistics of the meta-training demonstrations."""
     inner_learning_rate: Positive = 5e-4
@@ -151,6 +153,7 @@ PRESETS: dict[str, ExperimentConfig] = {
         method=DmilConfig(
             hidden_layers=3,
             hidden_units=256,
+            output_scale=0.07,
             inner_learning_rate=5e-3,
             continuity_weight=0.0,
             order="first",
@@ -158,7 +161,7 @@ PRESETS: dict[str, ExperimentConfig] = {
             window=24,
         ),
         training=TrainingConfig(
-            iterations=4000, slots_per_group=5, learning_rate=5e-4, gradient_clip=10.0, checkpoint_every=500
+            iterations=4000, slots_per_group=5, learning_rate=1e-3, gradient_clip=10.0, checkpoint_every=500
         ),
         evaluation=EvaluationConfig(learning_rate=3e-3),
     ),

@@ -17,27 +17,29 @@ from torch.nn import functional
 __all__ = ["Parameters", "bank", "bank_each", "flatten", "initialise", "mlp", "own_states", "part", "unflatten"]
 
 Parameters: TypeAlias = Mapping[str, Tensor]
-OUTPUT_GAIN = 0.005
-"""Scale of the output layer's first weights, against He's."""
 
 
-def initialise(prefix: str, sizes: Sequence[int], stream: np.random.Generator, copies: int | None = None) -> Parameters:
-    """Draw the parameters of a perceptron: He-uniform weights (He et al. 2015), a tiny output layer, zero biases.
-
-    With a tiny output layer all sub-skills begin nearly equal, so the first labels spread over all of them; with a
-    common one a sub-skill that happens to begin worse than another is never chosen, and stays behind.
+def initialise(
+    prefix: str,
+    sizes: Sequence[int],
+    stream: np.random.Generator,
+    copies: int | None = None,
+    output_scale: float = 1.0,
+) -> Parameters:
+    """Draw the parameters of a perceptron: He-uniform weights (He et al. 2015), zero biases.
 
     Args:
         prefix: what the names begin with: ``{prefix}.{layer}.weight`` and ``{prefix}.{layer}.bias``.
         sizes: units from the input to the output, both included.
         stream: where the weights are drawn from.
         copies: draw a bank of so many networks, stacked along a first axis.
+        output_scale: scale of the output layer's weights, against He's.
     """
     generator = torch.Generator().manual_seed(int(stream.integers(2**63)))
     batch = () if copies is None else (copies,)
     parameters: dict[str, Tensor] = {}
     for layer, (fan_in, fan_out) in enumerate(itertools.pairwise(sizes)):
-        bound = (6 / fan_in) ** 0.5 * (1 if layer < len(sizes) - 2 else OUTPUT_GAIN)
+        bound = (6 / fan_in) ** 0.5 * (1 if layer < len(sizes) - 2 else output_scale)
         weight = torch.rand(*batch, fan_out, fan_in, generator=generator)
         parameters[f"{prefix}.{layer}.weight"] = (2 * weight - 1) * bound
         parameters[f"{prefix}.{layer}.bias"] = torch.zeros(*batch, fan_out)

@@ -74,10 +74,10 @@ class Dmil:
     def initial_parameters(self, stream: np.random.Generator) -> Parameters:
         """Draw the high level and the bank of sub-skills."""
         hidden = [self.config.hidden_units] * self.config.hidden_layers
-        inputs = len(self.standardise.mean)
+        inputs, k, scale = len(self.standardise.mean), self.config.sub_skills, self.config.output_scale
         return {
-            **initialise("high", [inputs, *hidden, self.config.sub_skills], stream),
-            **initialise("low", [inputs, *hidden, self.action_dim], stream, copies=self.config.sub_skills),
+            **initialise("high", [inputs, *hidden, k], stream, output_scale=scale),
+            **initialise("low", [inputs, *hidden, self.action_dim], stream, copies=k, output_scale=scale),
         }
 
     def sample(self, demonstrations: Sequence[Demonstration], stream: np.random.Generator) -> TaskBatch:

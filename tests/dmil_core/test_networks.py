@@ -27,14 +27,14 @@ def states(steps: int, seed: int = 0) -> torch.Tensor:
 @pytest.mark.parametrize("copies", [None, 1, 3])
 def test_initial_parameters_are_he_uniform_with_zero_biases(copies: int | None) -> None:
     sizes = [50, 40, 30, 20]
-    parameters = initialise("high", sizes, np.random.default_rng(0), copies)
+    parameters = initialise("high", sizes, np.random.default_rng(0), copies, output_scale=0.5)
     assert list(parameters) == [f"high.{layer}.{kind}" for layer in range(3) for kind in ("weight", "bias")]
-    for layer, gain in enumerate([6, 6, 3]):
+    for layer, scale in enumerate([1, 1, 0.5]):
         weight, bias = parameters[f"high.{layer}.weight"], parameters[f"high.{layer}.bias"]
         batch = () if copies is None else (copies,)
         assert weight.shape == (*batch, sizes[layer + 1], sizes[layer])
         assert torch.equal(bias, torch.zeros(*batch, sizes[layer + 1]))
-        bound = (gain / sizes[layer]) ** 0.5
+        bound = (6 / sizes[layer]) ** 0.5 * scale
         assert 0.95 * bound < weight.abs().max() <= bound
         assert weight.std().item() == pytest.approx(bound / 3**0.5, rel=0.1)
         assert weight.mean().item() == pytest.approx(0, abs=0.1 * bound)

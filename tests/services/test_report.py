@@ -1,0 +1,28 @@
+import json
+from pathlib import Path
+
+from services.report import draw_curves, read_metrics
+
+
+def spool(folder: Path, *records: tuple[str, object]) -> None:
+    (folder / "tracking.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
+
+
+def metrics(step: int, **values: float) -> tuple[str, object]:
+    return "metrics", {"step": step, "time": 0, "values": values}
+
+
+def test_metrics_are_read_in_order_and_an_iteration_done_again_counts_once(tmp_path: Path) -> None:
+    spool(tmp_path, ("tags", {}), metrics(2, agreement=0.5), metrics(1, agreement=0.1), metrics(2, agreement=0.7))
+    assert read_metrics(tmp_path) == [{"iteration": 1, "agreement": 0.1}, {"iteration": 2, "agreement": 0.7}]
+
+
+def test_a_folder_without_records_has_no_metrics(tmp_path: Path) -> None:
+    assert read_metrics(tmp_path) == []
+
+
+def test_curves_are_drawn_from_however_few_iterations(tmp_path: Path) -> None:
+    names = ("high_loss_before", "high_loss_after", "low_loss_before", "low_loss_after", "continuity_loss")
+    names += ("agreement", "sub_skill_entropy", "gradient_norm", "sub_skill_share/0", "sub_skill_share/1")
+    draw_curves([{"iteration": 1, **dict.fromkeys(names, 0.5)}], tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
