@@ -248,11 +248,7 @@ class Experiment:
         """
         evaluation = self.config.evaluation
         held_out = self.held_out_sets(data)
-        method = Dmil(
-            self.config.method,
-            self.suite.action_dim,
-            Standardisation(checkpoint.constants["observation_mean"], checkpoint.constants["observation_scale"]),
-        )
+        method = Dmil.restored(self.config.method, self.suite.action_dim, checkpoint.constants)
         shapes = {name: torch.Size(shape) for name, shape in checkpoint.manifest.shapes.items()}
         plan = trials(self.tasks, evaluation)
         shared_parameters = runner.share(checkpoint.state.parameters)

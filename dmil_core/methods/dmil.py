@@ -62,6 +62,12 @@ class Dmil:
     action_dim: int
     standardise: Standardisation
 
+    @classmethod
+    def restored(cls, config: DmilConfig, action_dim: int, constants: Mapping[str, np.ndarray]) -> "Dmil":
+        """Return the method whose `constants` were stored with its parameters."""
+        standardise = Standardisation(constants["observation_mean"], constants["observation_scale"])
+        return cls(config, action_dim, standardise)
+
     @property
     def sub_skills(self) -> int:
         """K."""
