@@ -78,7 +78,7 @@ class Checkpoint:
     @property
     def state(self) -> OuterState:
         """The learner's state."""
-        flat = np.concatenate([self.parameters[name].reshape(-1) for name in self.manifest.shapes])
+        flat = np.concatenate([array.reshape(-1) for array in self.parameters.values()])
         return OuterState(self.manifest.iteration, flat, **self._load("optimiser.safetensors"))
 
     @property

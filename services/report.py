@@ -107,11 +107,11 @@ def show(summary: Summary, tracking_uri: str | None = None) -> None:
             f"{split}: sub-skills take {shares} of the states; {use.in_use_per_task:.1f} in use per task; "
             f"the high level agrees with the best-fitting sub-skill on {use.agreement:.2f}"
         )
-        if len(use.share) > 1 and max(use.share) > COLLAPSED:
-            console.print(
-                f"warning: {split}: one sub-skill takes nearly all states, so the hierarchy is not used; "
-                "another seed, a smaller --training.learning-rate or --method.continuity-weight may help"
-            )
+    if any(len(use.share) > 1 and max(use.share) > COLLAPSED for use in summary.sub_skills.values()):
+        console.print(
+            "warning: one sub-skill takes nearly all states, so the hierarchy is not used; another --seed, a smaller "
+            "--training.learning-rate or --method.continuity-weight may help"
+        )
     if failed := {task: count for task, count in summary.failed_attempts.items() if count}:
         console.print("failed expert attempts: " + ", ".join(f"{task} {count}" for task, count in failed.items()))
     console.print("seconds: " + ", ".join(f"{phase} {spent:.0f}" for phase, spent in summary.seconds.items()))
