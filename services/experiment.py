@@ -23,7 +23,7 @@ from services.progress import Bar
 from services.provenance import library_versions
 from services.results import AdaptationResult, EpisodeResult, Split, write_rows
 from services.rollouts import Trial, TrialOutcome, trials
-from services.runners import LocalRunner, RayRunner, Runner
+from services.runners import LocalRunner, MetaTraining, RayRunner, Runner
 from services.suites.base import Attempt, TaskSuite
 from services.suites.metaworld import MetaWorldSuite
 from services.summary import Evaluation
@@ -214,7 +214,7 @@ class Experiment:
 
         if state.iteration >= training.iterations and resume is not None:
             return resume
-        runner.start_training(method, shapes, sets, state, training, self.config.seed)
+        runner.start_training(MetaTraining(method, shapes, sets, state, training, self.config.seed))
         losses: list[float] = []
         path = None
         try:

@@ -7,7 +7,7 @@ import signal
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 
@@ -20,9 +20,22 @@ from services.actors.learner import Learner
 from services.actors.simulation import SimulationWorker
 from services.suites.base import TaskSuite
 
-__all__ = ["LocalRunner", "RayRunner", "Runner"]
+__all__ = ["LocalRunner", "MetaTraining", "RayRunner", "Runner"]
 
 OBJECT_STORE_BYTES = 500_000_000
+
+
+class MetaTraining(NamedTuple):
+    """What meta-training starts from; only the state changes on the way."""
+
+    method: MetaLearner[Any]
+    shapes: Mapping[str, torch.Size]
+    """Names and shapes of the parameters, in the order in which they are laid out flat."""
+    demonstrations: Mapping[str, Sequence[Demonstration]]
+    """The training demonstrations of each meta-training task."""
+    state: OuterState
+    settings: TrainingConfig
+    seed: int
 
 
 class Runner(Protocol):
@@ -38,15 +51,7 @@ class Runner(Protocol):
         """Call a method of the simulation workers with each of `calls`; yield index and result as they come."""
         ...
 
-    def start_training(
-        self,
-        method: MetaLearner[Any],
-        shapes: Mapping[str, torch.Size],
-        demonstrations: Mapping[str, Sequence[Demonstration]],
-        state: OuterState,
-        training: TrainingConfig,
-        seed: int,
-    ) -> None:
+    def start_training(self, plan: MetaTraining) -> None:
         """Make the learner and the adaptation workers."""
         ...
 
@@ -85,19 +90,11 @@ class LocalRunner:
         for index, call in enumerate(calls):
             yield index, getattr(self._simulation, method)(*call)
 
-    def start_training(
-        self,
-        method: MetaLearner[Any],
-        shapes: Mapping[str, torch.Size],
-        demonstrations: Mapping[str, Sequence[Demonstration]],
-        state: OuterState,
-        training: TrainingConfig,
-        seed: int,
-    ) -> None:
+    def start_training(self, plan: MetaTraining) -> None:
         """Make the learner and one adaptation worker."""
-        self._groups = groups(training)
-        self._learner = Learner(state, training)
-        self._worker = AdaptationWorker(method, shapes, demonstrations, seed)
+        self._groups = groups(plan.settings)
+        self._learner = Learner(plan.state, plan.settings)
+        self._worker = AdaptationWorker(plan.method, plan.shapes, plan.demonstrations, plan.seed)
         self._parameters = self._learner.parameters()
 
     def iterate(self, iteration: int, tasks: Sequence[str]) -> tuple[list[Mapping[str, float]], float]:
@@ -169,23 +166,15 @@ class RayRunner:
         finally:
             pool.close()
 
-    def start_training(
-        self,
-        method: MetaLearner[Any],
-        shapes: Mapping[str, torch.Size],
-        demonstrations: Mapping[str, Sequence[Demonstration]],
-        state: OuterState,
-        training: TrainingConfig,
-        seed: int,
-    ) -> None:
+    def start_training(self, plan: MetaTraining) -> None:
         """Start the learner and the adaptation workers; the demonstrations travel to each node once."""
-        self._groups = groups(training)
-        self._learner: Any = self._ray.remote(num_cpus=0)(Learner).remote(state, training)
+        self._groups = groups(plan.settings)
+        self._learner: Any = self._ray.remote(num_cpus=0)(Learner).remote(plan.state, plan.settings)
         self._parameters = self._learner.parameters.remote()
         remote = self._ray.remote(num_cpus=1)(AdaptationWorker)
-        shared = self._ray.put(demonstrations)
+        shared = self._ray.put(plan.demonstrations)
         self._adaptation = self._pool(
-            lambda: remote.remote(method, shapes, shared, seed), min(self.workers, len(self._groups))
+            lambda: remote.remote(plan.method, plan.shapes, shared, plan.seed), min(self.workers, len(self._groups))
         )
 
     def iterate(self, iteration: int, tasks: Sequence[str]) -> tuple[list[Mapping[str, float]], float]:

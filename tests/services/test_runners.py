@@ -14,7 +14,7 @@ from dmil_core.outer_loop import OuterState, tasks_of
 from services.demo_store import DemoStore
 from services.experiment import Experiment, open_runner
 from services.results import EpisodeResult
-from services.runners import RayRunner, Runner
+from services.runners import MetaTraining, RayRunner, Runner
 
 ITERATIONS = 4
 
@@ -32,7 +32,7 @@ def iterate(runner: Runner, experiment: Experiment, data, disturb=lambda iterati
     initial = experiment.initial_parameters(method)
     shapes = {name: tensor.shape for name, tensor in initial.items()}
     state = OuterState.start(flatten(initial).numpy())
-    runner.start_training(method, shapes, sets, state, config.training, config.seed)
+    runner.start_training(MetaTraining(method, shapes, sets, state, config.training, config.seed))
     seen = []
     for iteration in range(ITERATIONS):
         disturb(iteration)
