@@ -125,6 +125,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
         sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block", "--num-cpus=3",
         "--node-ip-address=127.0.0.1", f"--port={port}", "--dashboard-host=127.0.0.1",
         f"--dashboard-port={dashboard_port}", "--include-dashboard=true", f"--temp-dir={folder}",
+        f"--dashboard-agent-listen-port={free_port()}",  # another cluster may hold the usual one
         "--object-store-memory=200000000", "--disable-usage-stats",
     ]  # fmt: skip
     with log.open("w") as output:
