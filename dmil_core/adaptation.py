@@ -1,99 +1,182 @@
 """The dual inner loop of Algorithm 1: the high level first, then the sub-skills under the adapted high level."""
 
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dmil_core.losses import Steps, behaviour_cloning_loss, high_level_loss, sub_skill_labels
-from dmil_core.networks import Parameters, bank, bank_each, mlp, own_states, part
+from dmil_core.losses import (
+    Steps,
+    behaviour_cloning_loss,
+    differentiated,
+    high_level_loss,
+    squared_errors,
+    sub_skill_labels,
+)
+from dmil_core.networks import Network, Parameters, bank, mlp, network, own_states, stacked
+from dmil_core.slopes import Slope, slope
 
-__all__ = ["Adapted", "adapt", "choose", "high_level_objective", "label", "sub_skill_objective"]
+__all__ = [
+    "Adapted",
+    "Hierarchy",
+    "InnerStep",
+    "act",
+    "adapt",
+    "choose",
+    "high_level_slope",
+    "inner_loop",
+    "label",
+    "sub_skill_slopes",
+]
+
+
+class Hierarchy(NamedTuple):
+    """The networks of both levels."""
+
+    high: Network
+    low: tuple[Network, ...]
+
+    @classmethod
+    def of(cls, parameters: Parameters) -> "Hierarchy":
+        """Return views of the high level (``high.*``) and of the bank of sub-skills (``low.*``)."""
+        return cls(network(parameters, "high"), bank(parameters, "low"))
+
+    @property
+    def parameters(self) -> Parameters:
+        """The named parameters, the sub-skills stacked into a bank."""
+        levels = {"high": self.high, "low": stacked(self.low)}
+        return {
+            f"{level}.{index}.{name}": tensor
+            for level, layers in levels.items()
+            for index, layer in enumerate(layers)
+            for name, tensor in layer._asdict().items()
+        }
+
+
+class InnerStep(NamedTuple):
+    """One step of the dual inner loop: what each level went down, and where they arrived."""
+
+    high: Slope
+    low: Mapping[int, Slope]
+    """Of each sub-skill that was given any states."""
+    adapted: Hierarchy
 
 
 class Adapted(NamedTuple):
-    """Adapted parameters, and each level's loss before each inner step."""
+    """Adapted networks, and each level's loss before each inner step."""
 
-    parameters: Parameters
+    hierarchy: Hierarchy
     high_losses: tuple[float, ...]
     low_losses: tuple[float, ...]
 
 
 @torch.no_grad()
-def label(low: Parameters, steps: Steps) -> Int[Tensor, " steps"]:
+def label(low: Sequence[Network], steps: Steps) -> Int[Tensor, " steps"]:
     """Return for each step the sub-skill that explains its action best, the target of equation 3."""
-    return sub_skill_labels(bank(low, steps.states), steps.actions)
+    return sub_skill_labels(torch.stack([_errors(sub_skill, steps) for sub_skill in low]))
 
 
 @torch.no_grad()
-def choose(high: Parameters, states: Float[Tensor, "steps obs_dim"]) -> Int[Tensor, " steps"]:
+def _errors(sub_skill: Network, steps: Steps) -> Float[Tensor, " steps"]:
+    return squared_errors(mlp(sub_skill, steps.states), steps.actions)
+
+
+@torch.no_grad()
+def choose(high: Network, states: Float[Tensor, "steps obs_dim"]) -> Int[Tensor, " steps"]:
     """Return for each step the sub-skill that the high level takes: argmax_k π_h(k|s)."""
     return mlp(high, states).argmax(-1)
 
 
-def high_level_objective(
-    high: Parameters, steps: Steps, labels: Int[Tensor, " steps"], continuity_weight: float
-) -> Float[Tensor, ""]:
+@torch.no_grad()
+def act(
+    hierarchy: Hierarchy, states: Float[Tensor, "steps obs_dim"]
+) -> tuple[Float[Tensor, "steps action_dim"], Int[Tensor, " steps"]]:
+    """Return for each state the action of the sub-skill that the high level takes, and which one that is."""
+    chosen = choose(hierarchy.high, states)
+    first, *others = set(chosen.tolist())
+    if not others:
+        return mlp(hierarchy.low[first], states), chosen
+    own = own_states(chosen, len(hierarchy.low))
+    actions = [mlp(sub_skill, states[index]) for sub_skill, index in zip(hierarchy.low, own, strict=True) if len(index)]
+    return torch.cat(actions)[torch.cat(own).argsort()], chosen
+
+
+def high_level_slope(high: Network, steps: Steps, labels: Int[Tensor, " steps"], continuity_weight: float) -> Slope:
     """Return L_h of the high level on `steps` (equation 3 with Appendix C's term)."""
-    return high_level_loss(mlp(high, steps.states), labels, steps.lengths, continuity_weight)
+
+    def loss(logits: Tensor) -> Tensor:
+        return high_level_loss(logits, labels, steps.lengths, continuity_weight)
+
+    return slope(high, steps.states, lambda logits: differentiated(loss, logits))
 
 
-def sub_skill_objective(low: Parameters, steps: Steps, chosen: Int[Tensor, " steps"]) -> Float[Tensor, ""]:
-    """Return Σ_k L_BC of the sub-skills, each run only on the states the high level gave it (equation 4)."""
-    own = own_states(chosen, next(iter(low.values())).shape[0])
-    predictions = bank_each(low, [steps.states[index] for index in own])
-    return behaviour_cloning_loss(predictions, [steps.actions[index] for index in own])
+def sub_skill_slopes(low: Sequence[Network], steps: Steps, chosen: Int[Tensor, " steps"]) -> dict[int, Slope]:
+    """Return L_BC of each sub-skill on the states that the high level gave it, where there are any (equation 4)."""
+    own = own_states(chosen, len(low))
+
+    def of(k: int) -> Slope:
+        actions = steps.actions[own[k]]
+        return slope(low[k], steps.states[own[k]], lambda p: behaviour_cloning_loss(p, actions))
+
+    return {k: of(k) for k in range(len(low)) if len(own[k])}
+
+
+def inner_loop(
+    hierarchy: Hierarchy,
+    support_high: Steps,
+    support_low: Steps,
+    *,
+    learning_rate: float,
+    continuity_weight: float,
+    keep: bool = False,
+) -> Iterator[InnerStep]:
+    """Go down both levels' losses in turn, step after step without end (Algorithm 1); `hierarchy` stays as it is.
+
+    Args:
+        hierarchy: where to start.
+        support_high: τ1, which adapts the high level; its labels come from the current sub-skills.
+        support_low: τ2, which adapts each sub-skill on the states that the adapted high level gives it. At test
+            both are the support set.
+        learning_rate: α.
+        continuity_weight: λ of Appendix C.
+        keep: keep each step's networks as they were, for `Slope.pull_back`; else the next step overwrites them.
+    """
+    high, low = hierarchy
+
+    def descend(slope: Slope, origin: Network) -> Network:
+        return slope.descend(learning_rate, in_place=not keep and slope.network is not origin)
+
+    errors = [_errors(sub_skill, support_high) for sub_skill in low]
+    while True:
+        labels = sub_skill_labels(torch.stack(errors))
+        of_high = high_level_slope(high, support_high, labels, continuity_weight)
+        high = descend(of_high, hierarchy.high)
+        of_low = sub_skill_slopes(low, support_low, choose(high, support_low.states))
+        low = tuple(descend(of_low[k], hierarchy.low[k]) if k in of_low else low[k] for k in range(len(low)))
+        yield InnerStep(of_high, of_low, Hierarchy(high, low))
+        # A sub-skill that was given no states is still the same.
+        errors = [_errors(low[k], support_high) if k in of_low else errors[k] for k in range(len(low))]
 
 
 def adapt(
-    parameters: Parameters,
+    hierarchy: Hierarchy,
     support_high: Steps,
     support_low: Steps,
     *,
     steps: int,
     learning_rate: float,
     continuity_weight: float,
-    differentiable: bool = False,
 ) -> Adapted:
-    """Run the dual inner loop of Algorithm 1 and return the adapted parameters; `parameters` stay as they are.
-
-    Args:
-        parameters: of the high level (``high.*``) and of the sub-skills (``low.*``).
-        support_high: τ1, which adapts the high level; its labels come from the current sub-skills.
-        support_low: τ2, which adapts each sub-skill on the states that the adapted high level gives it. At test
-            both are the support set.
-        steps: of gradient descent on each level.
-        learning_rate: α.
-        continuity_weight: λ of Appendix C.
-        differentiable: keep the graph through all steps, for the exact second-order meta-gradient.
-    """
-    high, low = part(parameters, "high"), part(parameters, "low")
+    """Run so many steps of the `inner_loop`."""
     high_losses, low_losses = [], []
-    for _ in range(steps):
-        labels = label(low, support_high)
-        high = _trainable(high, differentiable)
-        objective = high_level_objective(high, support_high, labels, continuity_weight)
-        high = _descend(high, objective, learning_rate, differentiable)
-        high_losses.append(objective.item())
-
-        chosen = choose(high, support_low.states)
-        low = _trainable(low, differentiable)
-        objective = sub_skill_objective(low, support_low, chosen)
-        low = _descend(low, objective, learning_rate, differentiable)
-        low_losses.append(objective.item())
-    adapted = {**high, **low}
-    return Adapted({name: adapted[name] for name in parameters}, tuple(high_losses), tuple(low_losses))
-
-
-def _trainable(parameters: Parameters, differentiable: bool) -> Parameters:
-    """Return `parameters`, cut from the steps before unless the whole loop is to be differentiated."""
-    return parameters if differentiable else {name: t.detach().requires_grad_() for name, t in parameters.items()}
-
-
-def _descend(parameters: Parameters, objective: Tensor, learning_rate: float, differentiable: bool) -> Parameters:
-    """Return the parameters after one step of gradient descent."""
-    gradients = torch.autograd.grad(objective, list(parameters.values()), create_graph=differentiable)
-    with torch.set_grad_enabled(differentiable):
-        steps = zip(parameters.items(), gradients, strict=True)
-        return {name: torch.sub(tensor, gradient, alpha=learning_rate) for (name, tensor), gradient in steps}
+    loop = inner_loop(
+        hierarchy, support_high, support_low, learning_rate=learning_rate, continuity_weight=continuity_weight
+    )
+    for step in itertools.islice(loop, steps):
+        hierarchy = step.adapted
+        high_losses.append(step.high.loss.value.item())
+        low_losses.append(sum(of_low.loss.value.item() for of_low in step.low.values()))
+    return Adapted(hierarchy, tuple(high_losses), tuple(low_losses))

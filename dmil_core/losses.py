@@ -1,6 +1,6 @@
 """The losses of DMIL: equations 3, 4 and 15 of the paper, and the labels that tie its two levels together."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +11,17 @@ from torch.nn import functional
 
 from dmil_core.demonstrations import Demonstration, Standardisation
 
-__all__ = ["Steps", "behaviour_cloning_loss", "continuity_loss", "high_level_loss", "sub_skill_labels", "switching"]
+__all__ = [
+    "OutputLoss",
+    "Steps",
+    "behaviour_cloning_loss",
+    "continuity_loss",
+    "differentiated",
+    "high_level_loss",
+    "squared_errors",
+    "sub_skill_labels",
+    "switching",
+]
 
 
 class Steps(NamedTuple):
@@ -30,11 +40,42 @@ class Steps(NamedTuple):
         return cls(torch.from_numpy(standardise(observations)), torch.from_numpy(actions), torch.tensor(lengths))
 
 
-def sub_skill_labels(
-    predictions: Float[Tensor, "sub_skills steps action_dim"], actions: Float[Tensor, "steps action_dim"]
-) -> Int[Tensor, " steps"]:
-    """Return argmin_k ‖π_k(s_t) − a_t‖² for each step: the E-step of the hard EM, without gradient (equation 3)."""
-    return (predictions.detach() - actions).square().sum(-1).argmin(0)
+class OutputLoss(NamedTuple):
+    """A loss as a function of a network's outputs, at one point."""
+
+    value: Float[Tensor, ""]
+    gradient: Float[Tensor, "steps outputs"]
+    curvature: Callable[[Float[Tensor, "steps outputs"]], Float[Tensor, "steps outputs"]]
+    """Multiplies by the Hessian."""
+
+
+def differentiated(
+    loss: Callable[[Float[Tensor, "steps outputs"]], Float[Tensor, ""]], outputs: Float[Tensor, "steps outputs"]
+) -> OutputLoss:
+    """Differentiate a loss automatically."""
+    at = outputs.detach().requires_grad_()
+
+    @torch.enable_grad()
+    def curvature(direction: Tensor) -> Tensor:
+        (gradient,) = torch.autograd.grad(loss(at), at, create_graph=True)
+        return torch.autograd.grad(gradient, at, direction)[0]
+
+    with torch.enable_grad():
+        value = loss(at)
+    (gradient,) = torch.autograd.grad(value, at)
+    return OutputLoss(value.detach(), gradient, curvature)
+
+
+def squared_errors(
+    predictions: Float[Tensor, "steps action_dim"], actions: Float[Tensor, "steps action_dim"]
+) -> Float[Tensor, " steps"]:
+    """Return ‖π_k(s_t) − a_t‖² for each step."""
+    return (predictions - actions).square().sum(-1)
+
+
+def sub_skill_labels(errors: Float[Tensor, "sub_skills steps"]) -> Int[Tensor, " steps"]:
+    """Return the sub-skill with the least squared error for each step: the E-step of the hard EM (equation 3)."""
+    return errors.argmin(0)
 
 
 def high_level_loss(
@@ -49,21 +90,14 @@ def high_level_loss(
 
 
 def behaviour_cloning_loss(
-    predictions: Sequence[Float[Tensor, "_ action_dim"]], actions: Sequence[Float[Tensor, "_ action_dim"]]
-) -> Float[Tensor, ""]:
-    """Return Σ_k of sub-skill k's squared error ‖π_k(s) − a‖², averaged over its own states (equation 4).
+    predictions: Float[Tensor, "steps action_dim"], actions: Float[Tensor, "steps action_dim"]
+) -> OutputLoss:
+    """Return one sub-skill's squared error ‖π_k(s) − a‖², averaged over its own states (equation 4).
 
-    Each sub-skill has its own average, so one with few states learns as fast as one with many; a sub-skill without
-    a state contributes nothing.
-
-    Args:
-        predictions: for each sub-skill its actions on its own states.
-        actions: for each sub-skill the demonstrated actions in those states.
+    Each sub-skill has its own average, so one with few states learns as fast as one with many.
     """
-    errors = [
-        (own - wanted).square().sum(-1).mean() for own, wanted in zip(predictions, actions, strict=True) if len(own)
-    ]
-    return torch.stack(errors).sum()
+    errors, scale = predictions - actions, 2 / len(actions)
+    return OutputLoss(errors.square().sum() / len(actions), scale * errors, lambda direction: scale * direction)
 
 
 def switching(probabilities: Float[Tensor, "steps sub_skills"]) -> Float[Tensor, " pairs"]:

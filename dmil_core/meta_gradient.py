@@ -1,5 +1,6 @@
 """The outer gradient of Algorithm 1 for one task, and the fixed tree that adds the tasks' gradients."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -7,10 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dmil_core.adaptation import adapt, choose, high_level_objective, label, sub_skill_objective
+from dmil_core.adaptation import Hierarchy, choose, high_level_slope, inner_loop, label, sub_skill_slopes
 from dmil_core.configs import DmilConfig
 from dmil_core.losses import Steps, continuity_loss
-from dmil_core.networks import Parameters, flatten, mlp, part
+from dmil_core.networks import Parameters, unflatten
+from dmil_core.slopes import Slope
 
 __all__ = ["TaskGradient", "task_gradient", "tree_sum"]
 
@@ -32,43 +34,51 @@ def task_gradient(
 ) -> TaskGradient:
     """Return ∇_θ [L_h(λ_h, τ3) + Σ_k L_BC(λ_lk, D_4k)] of one task (Algorithm 1).
 
-    λ_h and λ_l come from the dual inner loop on τ1 and τ2. With ``config.order == "second"`` the gradient is exact,
-    through all inner steps; with ``"first"`` it is taken at the adapted parameters (FOMAML, Finn et al. 2017).
+    λ_h and λ_l come from the dual inner loop on τ1 and τ2. With ``config.order == "first"`` the gradient is taken at
+    the adapted parameters (FOMAML, Finn et al. 2017). With ``"second"`` it is exact: each inner step's Jacobian
+    I − αH pulls it back to θ, the last step first. Labels and choices have no gradient, so each network's steps are a
+    chain of their own.
     """
-    second = config.order == "second"
-    origin = {name: tensor.detach().requires_grad_(second) for name, tensor in parameters.items()}
-    adapted = adapt(
-        origin,
-        support_high,
-        support_low,
-        steps=config.inner_steps,
-        learning_rate=config.inner_learning_rate,
-        continuity_weight=config.continuity_weight,
-        differentiable=second,
-    )
-    leaves = origin if second else {name: t.detach().requires_grad_() for name, t in adapted.parameters.items()}
-    final = adapted.parameters if second else leaves
-    high, low = part(final, "high"), part(final, "low")
+    second, rate = config.order == "second", config.inner_learning_rate
+    weight = config.continuity_weight
+    start = Hierarchy.of(parameters)
+    loop = inner_loop(start, support_high, support_low, learning_rate=rate, continuity_weight=weight, keep=second)
+    path = list(itertools.islice(loop, config.inner_steps))
+    high, low = path[-1].adapted
 
     labels = label(low, query_high)
-    high_loss = high_level_objective(high, query_high, labels, config.continuity_weight)
+    of_high = high_level_slope(high, query_high, labels, weight)
     chosen = choose(high, query_low.states)
-    low_loss = sub_skill_objective(low, query_low, chosen)
-    gradients = torch.autograd.grad(high_loss + low_loss, list(leaves.values()))
+    of_low = sub_skill_slopes(low, query_low, chosen)
 
-    with torch.no_grad():
-        probabilities = mlp(high, query_high.states).softmax(-1)
-        shares = torch.bincount(chosen, minlength=config.sub_skills) / len(chosen)
-        metrics = {
-            "high_loss_before": adapted.high_losses[0],
-            "high_loss_after": high_loss.item(),
-            "low_loss_before": adapted.low_losses[0],
-            "low_loss_after": low_loss.item(),
-            "continuity_loss": continuity_loss(probabilities, query_high.lengths).item(),
-            "agreement": (probabilities.argmax(-1) == labels).float().mean().item(),
-            **{f"sub_skill_share/{k}": share for k, share in enumerate(shares.tolist())},
-        }
-    return TaskGradient(flatten(dict(zip(leaves, gradients, strict=True))), metrics)
+    gradient = torch.zeros(sum(tensor.numel() for tensor in parameters.values()), dtype=query_high.states.dtype)
+    vector = Hierarchy.of(unflatten(gradient, {name: tensor.shape for name, tensor in parameters.items()}))
+    of_high.add_gradient(vector.high)
+    for k, outer in of_low.items():
+        outer.add_gradient(vector.low[k])
+    if second:
+        for step in reversed(path):
+            step.high.pull_back(vector.high, rate)
+            for k in step.low.keys() & of_low.keys():
+                step.low[k].pull_back(vector.low[k], rate)
+
+    probabilities = of_high.outputs.softmax(-1)
+    shares = torch.bincount(chosen, minlength=config.sub_skills) / len(chosen)
+    metrics = {
+        "high_loss_before": path[0].high.loss.value.item(),
+        "high_loss_after": of_high.loss.value.item(),
+        "low_loss_before": _total(path[0].low),
+        "low_loss_after": _total(of_low),
+        "continuity_loss": continuity_loss(probabilities, query_high.lengths).item(),
+        "agreement": (probabilities.argmax(-1) == labels).float().mean().item(),
+        **{f"sub_skill_share/{k}": share for k, share in enumerate(shares.tolist())},
+    }
+    return TaskGradient(gradient, metrics)
+
+
+def _total(slopes: Mapping[int, Slope]) -> float:
+    """Return Σ_k L_BC."""
+    return sum(of_sub_skill.loss.value.item() for of_sub_skill in slopes.values())
 
 
 def tree_sum(terms: Sequence[Tensor]) -> Tensor:

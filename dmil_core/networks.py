@@ -1,12 +1,12 @@
-"""Networks as pure functions of named tensors: a multi-layer perceptron, and a bank of K of them.
+"""Perceptrons as pure functions of named tensors, alone or in a bank of K.
 
-Parameters are a flat mapping of names to tensors: ``high.0.weight``, ``low.2.bias`` and so on; `part` picks one
-network out of it. A bank stacks its K networks along the first axis of every tensor.
+Parameters are a flat mapping of names to tensors: ``high.0.weight``, ``low.2.bias`` and so on. A bank stacks its K
+networks along the first axis of every tensor; `bank` and `network` give views of them as tuples of layers.
 """
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TypeAlias
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -14,9 +14,34 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["Parameters", "bank", "bank_each", "flatten", "initialise", "mlp", "own_states", "part", "unflatten"]
+__all__ = [
+    "BLOCK",
+    "Layer",
+    "Network",
+    "Parameters",
+    "activations",
+    "bank",
+    "flatten",
+    "initialise",
+    "mlp",
+    "network",
+    "own_states",
+    "stacked",
+    "unflatten",
+]
 
 Parameters: TypeAlias = Mapping[str, Tensor]
+
+
+class Layer(NamedTuple):
+    """An affine map."""
+
+    weight: Float[Tensor, "outputs inputs"]
+    bias: Float[Tensor, " outputs"]
+
+
+Network: TypeAlias = tuple[Layer, ...]
+"""A perceptron: ReLU between its layers (F.2)."""
 
 
 def initialise(
@@ -46,50 +71,47 @@ def initialise(
     return parameters
 
 
-def part(parameters: Parameters, prefix: str) -> Parameters:
-    """Return the entries whose names begin with `prefix` and a dot, in their order: layer by layer, weight first."""
-    return {name: tensor for name, tensor in parameters.items() if name.startswith(f"{prefix}.")}
+def network(parameters: Parameters, prefix: str) -> Network:
+    """Return the layers of the network whose names begin with `prefix` and a dot; no copy."""
+    tensors = [tensor for name, tensor in parameters.items() if name.startswith(f"{prefix}.")]
+    return tuple(map(Layer, tensors[::2], tensors[1::2]))
 
 
-def _layers(parameters: Parameters) -> Iterator[tuple[Tensor, Tensor, bool]]:
-    """Yield each layer's weight and bias, and whether a ReLU follows."""
-    tensors = list(parameters.values())
-    for index in range(0, len(tensors), 2):
-        yield tensors[index], tensors[index + 1], index + 2 < len(tensors)
+def bank(parameters: Parameters, prefix: str) -> tuple[Network, ...]:
+    """Return each network of a bank; no copy."""
+    layers = network(parameters, prefix)
+    unbound = (map(Layer, weights.unbind(0), biases.unbind(0)) for weights, biases in layers)
+    return tuple(zip(*unbound, strict=True))
 
 
-def mlp(parameters: Parameters, inputs: Float[Tensor, "steps inputs"]) -> Float[Tensor, "steps outputs"]:
-    """Apply one perceptron with ReLU between its layers (F.2)."""
-    for weight, bias, rectified in _layers(parameters):
-        inputs = functional.linear(inputs, weight, bias)
-        inputs = torch.relu(inputs) if rectified else inputs
-    return inputs
+def stacked(networks: Sequence[Network]) -> Network:
+    """Return a bank's layers with its networks along the first axis: the inverse of `bank`, as a copy."""
+    return tuple(Layer(*map(torch.stack, zip(*layers, strict=True))) for layers in zip(*networks, strict=True))
 
 
-def bank(parameters: Parameters, inputs: Float[Tensor, "steps inputs"]) -> Float[Tensor, "networks steps outputs"]:
-    """Apply every network of a bank to every input."""
-    networks = next(iter(parameters.values())).shape[0]
-    outputs = inputs.expand(networks, *inputs.shape)
-    for weight, bias, rectified in _layers(parameters):
-        outputs = torch.baddbmm(bias.unsqueeze(1), outputs, weight.mT)
-        outputs = (
-            outputs.relu_() if rectified and not outputs.requires_grad else outputs.relu() if rectified else outputs
-        )
-    return outputs
+BLOCK = 320
+"""Steps that go through all layers together: so few that what they leave behind stays in a core's own cache."""
+
+
+def activations(network: Network, inputs: Float[Tensor, "steps inputs"]) -> list[Float[Tensor, "steps _"]]:
+    """Return what goes into each layer, and last what the network puts out."""
+    values = [inputs]
+    for layer in network[:-1]:
+        values.append(functional.linear(values[-1], *layer).relu_())
+    return [*values, functional.linear(values[-1], *network[-1])]
+
+
+def mlp(network: Network, inputs: Float[Tensor, "steps inputs"]) -> Float[Tensor, "steps outputs"]:
+    """Return what the network puts out."""
+    if len(inputs) <= BLOCK:
+        return activations(network, inputs)[-1]
+    return torch.cat([activations(network, block)[-1] for block in inputs.split(BLOCK)])
 
 
 def own_states(chosen: Int[Tensor, " steps"], networks: int) -> list[Int[Tensor, " _"]]:
     """Return, for each network of a bank, the indices of the steps where it is the chosen one, in their order."""
     order = torch.argsort(chosen, stable=True)
     return list(order.split(torch.bincount(chosen, minlength=networks).tolist()))
-
-
-def bank_each(parameters: Parameters, inputs: Sequence[Float[Tensor, "_ inputs"]]) -> list[Float[Tensor, "_ outputs"]]:
-    """Apply each network of a bank to its own inputs alone; none at all is allowed."""
-    networks = zip(*(tensor.unbind(0) for tensor in parameters.values()), strict=True)
-    return [
-        mlp(dict(zip(parameters, tensors, strict=True)), own) for tensors, own in zip(networks, inputs, strict=True)
-    ]
 
 
 def flatten(parameters: Parameters) -> Float[Tensor, " size"]:

@@ -17,6 +17,7 @@ FLOORS = {
     "dmil_core.statistics": 0,
     "dmil_core.seeding": 0,
     "dmil_core.networks": 1,
+    "dmil_core.slopes": 1,
     "dmil_core.losses": 1,
     "dmil_core.adaptation": 1,
     "dmil_core.meta_gradient": 1,

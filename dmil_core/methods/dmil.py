@@ -15,12 +15,13 @@ import torch
 from jaxtyping import Float32, Int64
 
 from dmil_core import adaptation, meta_gradient
+from dmil_core.adaptation import Hierarchy
 from dmil_core.configs import DmilConfig
 from dmil_core.demonstrations import Demonstration, Standardisation, TaskBatch, sample_task_batch
 from dmil_core.losses import Steps
 from dmil_core.meta_gradient import TaskGradient
 from dmil_core.methods.base import Decision, FineTuning, SubSkillUse
-from dmil_core.networks import Parameters, bank, initialise, part
+from dmil_core.networks import Parameters, initialise
 
 __all__ = ["Dmil", "DmilPolicy"]
 
@@ -29,29 +30,25 @@ __all__ = ["Dmil", "DmilPolicy"]
 class DmilPolicy:
     """The most probable sub-skill acts: a = π_k(s), k = argmax π_h(s)."""
 
-    parameters: Parameters
+    hierarchy: Hierarchy
     standardise: Standardisation
 
     def start(self, episodes: int) -> Int64[np.ndarray, "episodes 0"]:
         """Return an empty memory: the choice depends on the state alone."""
         return np.zeros((episodes, 0), np.int64)
 
-    @torch.no_grad()
     def act(
         self, observations: Float32[np.ndarray, "episodes obs_dim"], memory: Int64[np.ndarray, "episodes 0"]
     ) -> Decision:
         """Choose one action and its sub-skill for each episode."""
-        states = torch.from_numpy(self.standardise(observations))
-        chosen = adaptation.choose(part(self.parameters, "high"), states)
-        actions = bank(part(self.parameters, "low"), states)[chosen, torch.arange(len(states))]
+        actions, chosen = adaptation.act(self.hierarchy, torch.from_numpy(self.standardise(observations)))
         return Decision(actions.numpy(), chosen.numpy(), memory)
 
-    @torch.no_grad()
     def sub_skill_use(self, demonstration: Demonstration) -> SubSkillUse:
         """Return the high level's choice and the argmin label (equation 3) at each step."""
         steps = Steps.of([demonstration], self.standardise)
-        chosen = adaptation.choose(part(self.parameters, "high"), steps.states)
-        return SubSkillUse(chosen.numpy(), adaptation.label(part(self.parameters, "low"), steps).numpy())
+        chosen = adaptation.choose(self.hierarchy.high, steps.states)
+        return SubSkillUse(chosen.numpy(), adaptation.label(self.hierarchy.low, steps).numpy())
 
 
 @dataclass(frozen=True)
@@ -101,11 +98,11 @@ class Dmil:
         """Run the dual inner loop with the support set as both τ1 and τ2."""
         steps = Steps.of(support, self.standardise)
         adapted = adaptation.adapt(
-            parameters,
+            Hierarchy.of(parameters),
             steps,
             steps,
             steps=fine_tuning.steps,
             learning_rate=fine_tuning.learning_rate,
             continuity_weight=self.config.continuity_weight,
         )
-        return DmilPolicy(adapted.parameters, self.standardise)
+        return DmilPolicy(adapted.hierarchy, self.standardise)

@@ -1,20 +1,32 @@
-"""What the tests of the science share: ragged trajectories and small networks."""
+"""What the tests of the science share: ragged trajectories, small networks and their twin."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import hypothesis
+import jaxtyping
 import numpy as np
 import pytest
 import torch
+from torch.nn import functional
 
 from dmil_core.demonstrations import Demonstration
 from dmil_core.losses import Steps
-from dmil_core.networks import Parameters, initialise
+from dmil_core.networks import Layer, Network, Parameters, initialise
+from dmil_core.slopes import Slope
 
 OBS_DIM, ACTION_DIM = 4, 3
 
 hypothesis.settings.register_profile("numbers", deadline=None, max_examples=50, derandomize=True)
 hypothesis.settings.load_profile("numbers")
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Leave out the run-time type checks of the tests, as in use: to hand in wrong shapes, or to train for long."""
+    before = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", before)
 
 
 @pytest.fixture(scope="session")
@@ -50,6 +62,30 @@ def make_parameters() -> Callable[..., Parameters]:
         }
 
     return make
+
+
+@pytest.fixture(scope="session")
+def plain_mlp() -> Callable[[Network, torch.Tensor], torch.Tensor]:
+    """Run a perceptron by torch.nn.functional alone."""
+
+    def plain(network: Network, inputs: torch.Tensor) -> torch.Tensor:
+        for weight, bias in network[:-1]:
+            inputs = functional.relu(functional.linear(inputs, weight, bias))
+        return functional.linear(inputs, *network[-1])
+
+    return plain
+
+
+@pytest.fixture(scope="session")
+def gradient_of() -> Callable[[Slope], Network]:
+    """Have a slope add its gradient to nothing."""
+
+    def gradient(slope: Slope) -> Network:
+        out = tuple(Layer(*map(torch.zeros_like, layer)) for layer in slope.network)
+        slope.add_gradient(out)
+        return out
+
+    return gradient
 
 
 @pytest.fixture(scope="session")

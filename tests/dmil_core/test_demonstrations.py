@@ -3,9 +3,7 @@
 import dataclasses
 import itertools
 from collections import Counter
-from collections.abc import Iterator
 
-import jaxtyping
 import numpy as np
 import pytest
 from hypothesis import given
@@ -23,15 +21,6 @@ from dmil_core.demonstrations import (
 
 def zeros(*shape: int) -> np.ndarray:
     return np.zeros(shape, np.float32)
-
-
-@pytest.fixture
-def unchecked() -> Iterator[None]:
-    """Let wrong shapes pass the run-time type checks of the tests: in use there are none, and the class must refuse."""
-    before = jaxtyping.config.jaxtyping_disable
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", before)
 
 
 def spoiled(value: float) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -14,7 +15,9 @@ from dmil_core.losses import (
     Steps,
     behaviour_cloning_loss,
     continuity_loss,
+    differentiated,
     high_level_loss,
+    squared_errors,
     sub_skill_labels,
     switching,
 )
@@ -33,6 +36,12 @@ def normal(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
+def test_squared_errors_by_plain_loops() -> None:
+    predictions, actions = normal(7, 2), normal(7, 2, seed=1)
+    expected = [sum(float(predictions[t, d] - actions[t, d]) ** 2 for d in range(2)) for t in range(7)]
+    assert squared_errors(predictions, actions).tolist() == pytest.approx(expected, rel=1e-12)
+
+
 @pytest.mark.parametrize("sub_skills", [1, 2, 5])
 def test_label_is_the_sub_skill_with_the_least_squared_error(sub_skills: int) -> None:
     predictions, actions = normal(sub_skills, 20, 2), normal(20, 2, seed=1)
@@ -40,14 +49,15 @@ def test_label_is_the_sub_skill_with_the_least_squared_error(sub_skills: int) ->
     for t in range(20):
         errors = [sum(float(predictions[k, t, d] - actions[t, d]) ** 2 for d in range(2)) for k in range(sub_skills)]
         expected.append(errors.index(min(errors)))
-    labels = sub_skill_labels(predictions.requires_grad_(), actions)
+    labels = sub_skill_labels(torch.stack([squared_errors(own, actions) for own in predictions.requires_grad_()]))
     assert labels.tolist() == expected
     assert not labels.requires_grad
 
 
 def test_labels_pass_no_gradient_to_the_sub_skills() -> None:
     predictions, logits = normal(SUB_SKILLS, 6, 2).requires_grad_(), normal(6, SUB_SKILLS).requires_grad_()
-    loss = high_level_loss(logits, sub_skill_labels(predictions, normal(6, 2, seed=1)), torch.tensor([2, 4]), 0.5)
+    errors = torch.stack([squared_errors(own, normal(6, 2, seed=1)) for own in predictions])
+    loss = high_level_loss(logits, sub_skill_labels(errors), torch.tensor([2, 4]), 0.5)
     to_logits, to_predictions = torch.autograd.grad(loss, [logits, predictions], allow_unused=True)
     assert to_logits.abs().sum() > 0
     assert to_predictions is None
@@ -69,34 +79,76 @@ def test_high_level_loss_is_mean_cross_entropy_plus_weighted_switches(weight: fl
     assert loss.item() == pytest.approx(entropy + weight * switches, rel=1e-12)
 
 
-@given(st.lists(st.integers(0, 5), min_size=1, max_size=5).filter(any))
-def test_behaviour_cloning_averages_each_sub_skill_over_its_own_states(counts: list[int]) -> None:
-    predictions = [normal(count, 2, seed=k) for k, count in enumerate(counts)]
-    actions = [normal(count, 2, seed=10 + k) for k, count in enumerate(counts)]
-    expected = 0.0
-    for own, wanted in zip(predictions, actions, strict=True):
-        errors = [
-            sum((a - b) ** 2 for a, b in zip(*rows, strict=True))
-            for rows in zip(own.tolist(), wanted.tolist(), strict=True)
-        ]
-        expected += sum(errors) / len(errors) if errors else 0.0
-    assert behaviour_cloning_loss(predictions, actions).item() == pytest.approx(expected, rel=1e-12)
-
-
-def test_repeating_the_states_of_one_sub_skill_changes_nothing() -> None:
-    predictions, actions = [normal(2, 3), normal(4, 3, seed=1)], [normal(2, 3, seed=2), normal(4, 3, seed=3)]
-    repeated = behaviour_cloning_loss(
-        [predictions[0].repeat(5, 1), predictions[1]], [actions[0].repeat(5, 1), actions[1]]
+@given(st.integers(1, 9), st.integers(1, 4))
+def test_behaviour_cloning_averages_over_the_states(count: int, action_dim: int) -> None:
+    predictions, actions = normal(count, action_dim), normal(count, action_dim, seed=1)
+    expected = sum(
+        (a - b) ** 2
+        for own, wanted in zip(predictions.tolist(), actions.tolist(), strict=True)
+        for a, b in zip(own, wanted, strict=True)
     )
-    torch.testing.assert_close(repeated, behaviour_cloning_loss(predictions, actions), rtol=1e-12, atol=0)
+    assert behaviour_cloning_loss(predictions, actions).value.item() == pytest.approx(expected / count, rel=1e-12)
 
 
-def test_a_sub_skill_without_states_gets_a_zero_gradient_and_no_nan() -> None:
-    bank = normal(2, 4, 3).requires_grad_()
-    loss = behaviour_cloning_loss([bank[0], bank[1, :0]], [normal(4, 3, seed=1), torch.zeros(0, 3).double()])
-    (gradient,) = torch.autograd.grad(loss, bank)
-    assert gradient[0].abs().sum() > 0
-    assert torch.equal(gradient[1], torch.zeros(4, 3).double())
+def test_repeating_the_states_of_a_sub_skill_changes_nothing() -> None:
+    predictions, actions = normal(4, 3), normal(4, 3, seed=1)
+    once = behaviour_cloning_loss(predictions, actions)
+    repeated = behaviour_cloning_loss(predictions.repeat(5, 1), actions.repeat(5, 1))
+    torch.testing.assert_close(repeated.value, once.value, rtol=1e-12, atol=0)
+    torch.testing.assert_close(repeated.gradient.view(5, 4, 3).sum(0), once.gradient, rtol=1e-12, atol=1e-15)
+
+
+@given(steps=st.integers(1, 12), action_dim=st.integers(1, 5), seed=st.integers(0, 2**31))
+def test_behaviour_cloning_equals_its_formula_differentiated(steps: int, action_dim: int, seed: int) -> None:
+    predictions, actions = normal(steps, action_dim, seed=seed), normal(steps, action_dim, seed=seed + 1)
+    got = behaviour_cloning_loss(predictions, actions)
+    twin = differentiated(lambda outputs: ((outputs - actions) ** 2).sum(1).mean(), predictions)
+    direction = normal(steps, action_dim, seed=seed + 2)
+    torch.testing.assert_close(got[:2], twin[:2], rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(got.curvature(direction), twin.curvature(direction), rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.7])
+@pytest.mark.parametrize("lengths", [[1], [5], [1, 3, 1], [1] * 5], ids=str)
+def test_differentiated_equals_autograd(weight: float, lengths: list[int]) -> None:
+    """Within no_grad too, as it is used; the curvature against the full Hessian, row by row."""
+    logits = normal(sum(lengths), SUB_SKILLS)
+    labels = torch.tensor([2, 0, 1, 1, 0])[: len(logits)]
+
+    def loss(outputs: torch.Tensor) -> torch.Tensor:
+        return high_level_loss(outputs, labels, torch.tensor(lengths), weight)
+
+    leaf = logits.clone().requires_grad_()
+    value = loss(leaf)
+    (gradient,) = torch.autograd.grad(value, leaf)
+    hessian: Any = torch.autograd.functional.hessian(loss, logits)
+    hessian = hessian.reshape(logits.numel(), logits.numel())
+    before = logits.clone()
+    with torch.no_grad():
+        got = differentiated(loss, logits)
+        rows = torch.stack([got.curvature(unit.view_as(logits)).flatten() for unit in torch.eye(len(hessian)).double()])
+    torch.testing.assert_close(got[:2], (value.detach(), gradient), rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(rows, hessian, rtol=1e-12, atol=1e-14)
+    assert hessian.abs().max() > 0.01
+    assert torch.equal(logits, before)
+    assert not any(tensor.requires_grad for tensor in (logits, rows, *got[:2]))
+
+
+@pytest.mark.parametrize("closed_form", [True, False])
+def test_curvature_can_be_asked_again(closed_form: bool) -> None:
+    outputs, actions = normal(6, SUB_SKILLS), normal(6, SUB_SKILLS, seed=1)
+
+    def loss(logits: torch.Tensor) -> torch.Tensor:
+        return high_level_loss(logits, actions.argmax(-1), torch.tensor([2, 4]), 0.5)
+
+    at = behaviour_cloning_loss(outputs, actions) if closed_form else differentiated(loss, outputs)
+    one, other = normal(6, SUB_SKILLS, seed=2), normal(6, SUB_SKILLS, seed=3)
+    before, first = one.clone(), at.curvature(one)
+    kept = first.clone()
+    assert not torch.equal(at.curvature(other), first)
+    assert torch.equal(at.curvature(one), first)
+    assert torch.equal(first, kept)
+    assert torch.equal(one, before)
 
 
 @given(trajectories)

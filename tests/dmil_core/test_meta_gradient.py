@@ -12,7 +12,7 @@ from torch.nn import functional
 from dmil_core.configs import DmilConfig
 from dmil_core.losses import Steps
 from dmil_core.meta_gradient import task_gradient, tree_sum
-from dmil_core.networks import Parameters, flatten, unflatten
+from dmil_core.networks import BLOCK, Parameters, flatten, unflatten
 
 LENGTHS = ([12, 1, 9], [3, 19], [1, 1, 16, 5], [11, 7])
 Sets: TypeAlias = tuple[Steps, Steps, Steps, Steps]
@@ -108,6 +108,45 @@ def test_equals_the_plain_twin(
     assert relative_error(got.gradient, gradient) <= TOLERANCE[dtype]
     assert got.metrics["high_loss_after"] == pytest.approx(high, rel=TOLERANCE[dtype], abs=TOLERANCE[dtype])
     assert got.metrics["low_loss_after"] == pytest.approx(low, rel=TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
+@pytest.mark.parametrize("order", ["first", "second"])
+@pytest.mark.parametrize("hidden", [(), (8,), (9, 6, 7, 8)], ids=lambda hidden: f"{len(hidden)} hidden")
+def test_equals_the_plain_twin_at_any_depth(make_parameters, make_steps, hidden, order, dtype) -> None:
+    config, parameters = settings(3, inner_steps=3, order=order), make_parameters(0, 3, hidden, dtype)
+    sets = draw_sets(make_steps, dtype)
+    got, wanted = task_gradient(parameters, *sets, config).gradient, Twin(config)(parameters, sets)[0]
+    assert relative_error(got, wanted) <= TOLERANCE[dtype]
+
+
+@pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
+@pytest.mark.parametrize("order", ["first", "second"])
+def test_equals_the_plain_twin_on_several_blocks_of_steps(make_parameters, make_steps, order, dtype) -> None:
+    config, parameters = settings(3, inner_steps=2, order=order), make_parameters(0, 3, dtype=dtype)
+    one, two, three, four = (make_steps(seed, [BLOCK // 2, 2 * BLOCK + seed], dtype) for seed in range(4))
+    got = task_gradient(parameters, one, two, three, four, config).gradient
+    assert relative_error(got, Twin(config)(parameters, (one, two, three, four))[0]) <= TOLERANCE[dtype]
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    sub_skills=st.integers(1, 6),
+    lengths=st.lists(st.lists(st.integers(1, 4), min_size=1, max_size=3), min_size=4, max_size=4),
+    inner_steps=st.integers(1, 4),
+    order=st.sampled_from(["first", "second"]),
+)
+def test_equals_the_plain_twin_on_few_states(
+    make_parameters, make_steps, seed, sub_skills, lengths, inner_steps, order
+) -> None:
+    """Sub-skills are left without states in some of the inner steps, in the outer one, or in all."""
+    config, parameters = settings(sub_skills, inner_steps=inner_steps, order=order), make_parameters(seed, sub_skills)
+    one, two, three, four = (make_steps(seed + index, own) for index, own in enumerate(lengths))
+    gradient, high, low = Twin(config)(parameters, (one, two, three, four))
+    got = task_gradient(parameters, one, two, three, four, config)
+    torch.testing.assert_close(got.gradient, gradient, rtol=1e-9, atol=1e-10)
+    assert got.metrics["high_loss_after"] == pytest.approx(high, rel=1e-9, abs=1e-10)
+    assert got.metrics["low_loss_after"] == pytest.approx(low, rel=1e-9)
 
 
 @pytest.mark.parametrize("order", ["first", "second"])

@@ -1,4 +1,4 @@
-"""Networks as functions of named tensors, against torch.nn and against loops."""
+"""Networks as views of named tensors, against torch.nn and against loops."""
 
 import itertools
 
@@ -8,7 +8,18 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmil_core.networks import bank, bank_each, flatten, initialise, mlp, own_states, part, unflatten
+from dmil_core.networks import (
+    BLOCK,
+    activations,
+    bank,
+    flatten,
+    initialise,
+    mlp,
+    network,
+    own_states,
+    stacked,
+    unflatten,
+)
 
 SIZES = [4, 6, 5, 3]
 
@@ -49,54 +60,126 @@ def test_initial_parameters_follow_their_stream() -> None:
     assert not torch.equal(initialise("a", SIZES, stream)["a.0.weight"], initialise("a", SIZES, stream)["a.0.weight"])
 
 
-def test_part_takes_whole_names() -> None:
-    tensor = torch.zeros(1)
-    assert list(part({"high.0.weight": tensor, "higher.0.weight": tensor, "low.high.bias": tensor}, "high")) == [
-        "high.0.weight"
+def module(layers: list[tuple[torch.Tensor, torch.Tensor]]) -> torch.nn.Sequential:
+    """Return the perceptron of torch.nn with copies of these weights and biases."""
+    modules: list[torch.nn.Module] = []
+    for weight, bias in layers:
+        linear = torch.nn.Linear(weight.shape[1], weight.shape[0])
+        linear.load_state_dict({"weight": weight, "bias": bias})
+        modules += [linear, torch.nn.ReLU()]
+    return torch.nn.Sequential(*modules[:-1])
+
+
+def pairs(parameters: dict[str, torch.Tensor], k: int | None = None) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Return weight and bias of each layer by their names, of one network of a bank where k is given."""
+    named = [
+        (parameters[f"net.{layer}.weight"], parameters[f"net.{layer}.bias"]) for layer in range(len(parameters) // 2)
     ]
+    return named if k is None else [(weight[k], bias[k]) for weight, bias in named]
 
 
-def test_mlp_equals_a_torch_module() -> None:
+def test_a_network_takes_whole_names() -> None:
+    weight, bias, other = torch.zeros(1, 1), torch.ones(1), torch.zeros(1)
+    parameters = {
+        "higher.0.weight": other,
+        "high.0.weight": weight,
+        "low.high.bias": other,
+        "high.0.bias": bias,
+        "high": other,
+    }
+    ((got_weight, got_bias),) = network(parameters, "high")
+    assert got_weight is weight
+    assert got_bias is bias
+
+
+def test_a_network_is_its_layers_without_a_copy() -> None:
     parameters = drawn()
-    layers = [torch.nn.Linear(*pair) for pair in itertools.pairwise(SIZES)]
-    module = torch.nn.Sequential(layers[0], torch.nn.ReLU(), layers[1], torch.nn.ReLU(), layers[2])
-    with torch.no_grad():
-        for target, value in zip(module.parameters(), parameters.values(), strict=True):
-            target.copy_(value)
-    torch.testing.assert_close(mlp(parameters, states(9)), module(states(9)).detach())
+    layers = network(parameters, "net")
+    assert [(layer.weight, layer.bias) for layer in layers] == pairs(parameters)
+    for layer in layers:
+        layer.weight.fill_(2)
+        layer.bias.fill_(3)
+    assert all((t == (2 if name.endswith("weight") else 3)).all() for name, t in parameters.items())
+
+
+def test_writing_to_one_network_of_a_bank_shows_in_its_row_alone() -> None:
+    parameters, before = drawn(copies=3), drawn(copies=3)
+    for weight, bias in bank(parameters, "net")[1]:
+        weight.zero_()
+        bias.zero_()
+    for name, tensor in parameters.items():
+        assert torch.equal(tensor[[0, 2]], before[name][[0, 2]])
+        assert not tensor[1].any()
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+def test_stacked_is_the_inverse_of_bank_and_a_copy(copies: int) -> None:
+    parameters, before = drawn(copies=copies), drawn(copies=copies)
+    layers = stacked(bank(parameters, "net"))
+    assert len(layers) == len(SIZES) - 1
+    for (weight, bias), (wanted_weight, wanted_bias) in zip(layers, pairs(parameters), strict=True):
+        assert torch.equal(weight, wanted_weight)
+        assert torch.equal(bias, wanted_bias)
+        weight.zero_()
+        bias.zero_()
+    assert all(torch.equal(tensor, before[name]) for name, tensor in parameters.items())
+
+
+def test_networks_of_unequal_depth_make_no_bank() -> None:
+    layers = network(drawn(), "net")
+    with pytest.raises(ValueError, match="shorter"):
+        stacked([layers, layers[:-1]])
+
+
+@pytest.mark.parametrize("depth", [1, 2, 3])
+@pytest.mark.parametrize("steps", [1, 9, BLOCK, BLOCK + 1, 2 * BLOCK + 3])
+def test_mlp_equals_a_torch_module(depth: int, steps: int) -> None:
+    parameters = dict(itertools.islice(drawn().items(), 2 * depth))
+    expected = module(pairs(parameters))(states(steps)).detach()
+    torch.testing.assert_close(mlp(network(parameters, "net"), states(steps)), expected)
 
 
 @pytest.mark.parametrize("networks", [1, 2, 5])
-@pytest.mark.parametrize("requires_grad", [False, True])
-def test_bank_equals_a_loop_over_mlp(networks: int, requires_grad: bool) -> None:
-    parameters = {name: tensor.requires_grad_(requires_grad) for name, tensor in drawn(copies=networks).items()}
-    inputs = states(7)
-    outputs = bank(parameters, inputs)
-    loop = torch.stack([mlp({name: t[k] for name, t in parameters.items()}, inputs) for k in range(networks)])
-    torch.testing.assert_close(outputs, loop)
-    assert torch.equal(inputs, states(7))
-    if requires_grad:
-        torch.testing.assert_close(
-            torch.autograd.grad(outputs.square().sum(), list(parameters.values())),
-            torch.autograd.grad(loop.square().sum(), list(parameters.values())),
-            rtol=1e-4,
-            atol=1e-5,
-        )
+def test_each_network_of_a_bank_equals_a_torch_module(networks: int) -> None:
+    parameters = drawn(copies=networks)
+    each = bank(parameters, "net")
+    assert len(each) == networks
+    outputs = [mlp(own, states(7)) for own in each]
+    for k, output in enumerate(outputs):
+        torch.testing.assert_close(output, module(pairs(parameters, k))(states(7)).detach())
+    assert not any(torch.equal(*two) for two in itertools.combinations(outputs, 2))
 
 
-@given(st.lists(st.integers(0, 3), min_size=1, max_size=20))
-def test_bank_each_equals_bank_on_own_states(chosen: list[int]) -> None:
-    parameters, inputs, choice = drawn(copies=4), states(len(chosen)), torch.tensor(chosen)
-    everything = bank(parameters, inputs)
-    outputs = bank_each(parameters, [inputs[choice == k] for k in range(4)])
-    assert len(outputs) == 4
-    for k, own in enumerate(outputs):
-        torch.testing.assert_close(own, everything[k, choice == k])
+def test_activations_are_the_inputs_of_every_layer_then_the_outputs() -> None:
+    parameters, inputs = drawn(), states(9)
+    twin, expected = module(pairs(parameters)), [inputs.clone()]
+    for index, layer in enumerate(twin):
+        value = layer(expected[-1]).detach()
+        expected = [*expected[:-1], value] if index % 2 else [*expected, value]
+    values = activations(network(parameters, "net"), inputs)
+    assert values[0] is inputs
+    assert torch.equal(inputs, states(9))
+    assert len(values) == len(SIZES)
+    torch.testing.assert_close(values, expected)
+    assert all((value >= 0).all() and (value == 0).any() for value in values[1:-1])
+    assert (values[-1] < 0).any()
 
 
-def test_bank_each_refuses_a_wrong_number_of_inputs() -> None:
-    with pytest.raises(ValueError, match="shorter"):
-        bank_each(drawn(copies=3), [states(2), states(2)])
+@pytest.mark.parametrize("steps", [7, BLOCK + 7])
+def test_mlp_can_be_differentiated(steps: int) -> None:
+    """Its ReLU works in place, which autograd must not notice; the twin's gradients do not go through it."""
+    parameters = {name: tensor.requires_grad_() for name, tensor in drawn().items()}
+    twin, inputs = module(pairs(parameters)), states(steps).requires_grad_()
+    got = torch.autograd.grad(
+        mlp(network(parameters, "net"), inputs).square().sum() / steps,
+        [inputs, *parameters.values()],
+        create_graph=True,
+    )
+    wanted = torch.autograd.grad(twin(inputs).square().sum() / steps, [inputs, *twin.parameters()], create_graph=True)
+    torch.testing.assert_close(got, wanted, rtol=1e-4, atol=1e-5)
+    (again,) = torch.autograd.grad(got[1].square().sum(), parameters["net.1.weight"])
+    (again_wanted,) = torch.autograd.grad(wanted[1].square().sum(), next(itertools.islice(twin.parameters(), 2, None)))
+    torch.testing.assert_close(again, again_wanted, rtol=1e-4, atol=1e-4)
 
 
 @given(st.integers(1, 6).flatmap(lambda n: st.tuples(st.just(n), st.lists(st.integers(0, n - 1), min_size=1))))

@@ -1,26 +1,29 @@
 """What the paper proves of its losses, as numbers: Lemma 1 and Theorem 2 (Appendix D)."""
 
+import itertools
+
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from torch.distributions import Independent, Normal
 
-from dmil_core.adaptation import adapt, choose, high_level_objective, label, sub_skill_objective
+from dmil_core.adaptation import Hierarchy, adapt, choose, high_level_slope, label, sub_skill_slopes
 from dmil_core.losses import Steps
-from dmil_core.networks import Parameters, bank, mlp, part
+from dmil_core.networks import Parameters, mlp
 
 SUB_SKILLS = 3
 
 
 def log_likelihoods(parameters: Parameters, steps: Steps, sigma: float) -> torch.Tensor:
     """log p(a_t | s_t, θ_k) of Gaussian sub-skills, a row for each."""
-    return Independent(Normal(bank(part(parameters, "low"), steps.states), sigma), 1).log_prob(steps.actions)
+    means = torch.stack([mlp(sub_skill, steps.states) for sub_skill in Hierarchy.of(parameters).low])
+    return Independent(Normal(means, sigma), 1).log_prob(steps.actions)
 
 
 def log_mixture(parameters: Parameters, steps: Steps, sigma: float) -> torch.Tensor:
     """log Σ_k p(z_k | s_t, θ_h) p(a_t | s_t, θ_k), equation 23."""
-    log_p = mlp(part(parameters, "high"), steps.states).log_softmax(-1)
+    log_p = mlp(Hierarchy.of(parameters).high, steps.states).log_softmax(-1)
     return (log_p.T + log_likelihoods(parameters, steps, sigma)).logsumexp(0)
 
 
@@ -35,17 +38,20 @@ def steps(make_steps) -> Steps:
 
 
 @pytest.mark.parametrize("sigma", [0.1, 1.0])
-def test_theorem_2_the_low_m_step_ascends_the_likelihood(leaves, steps, sigma: float) -> None:
+def test_theorem_2_the_low_m_step_ascends_the_likelihood(leaves, steps, gradient_of, sigma: float) -> None:
     """Equation 22: under a fixed assignment both gradients agree for each sub-skill, up to N_k / 2σ²."""
-    low, chosen = part(leaves, "low"), choose(part(leaves, "high"), steps.states)
-    counts = torch.bincount(chosen, minlength=SUB_SKILLS)
-    assert (counts > 0).sum() > 1
+    high, low = Hierarchy.of(leaves)
+    chosen = choose(high, steps.states)
+    counts = torch.bincount(chosen, minlength=SUB_SKILLS).tolist()
+    slopes = sub_skill_slopes(low, steps, chosen)
+    assert len(slopes) > 1
+    assert set(slopes) == {k for k, count in enumerate(counts) if count}
     likelihood = log_likelihoods(leaves, steps, sigma).gather(0, chosen[None]).sum()
-    of_likelihood = torch.autograd.grad(likelihood, list(low.values()))
-    of_loss = torch.autograd.grad(sub_skill_objective(low, steps, chosen), list(low.values()))
-    for ascent, descent in zip(of_likelihood, of_loss, strict=True):
-        for k, count in enumerate(counts.tolist()):
-            torch.testing.assert_close(ascent[k], -count / (2 * sigma**2) * descent[k], rtol=1e-9, atol=1e-12)
+    names = [name for name in leaves if name.startswith("low")]
+    of_likelihood = torch.autograd.grad(likelihood, [leaves[name] for name in names])
+    for k, of_loss in slopes.items():
+        for ascent, descent in zip(of_likelihood, itertools.chain(*gradient_of(of_loss)), strict=True):
+            torch.testing.assert_close(ascent[k], -counts[k] / (2 * sigma**2) * descent, rtol=1e-9, atol=1e-12)
 
 
 @given(seed=st.integers(0, 2**31), sigma=st.floats(0.3, 3.0))
@@ -53,7 +59,7 @@ def test_theorem_2_no_assignment_beats_the_label(make_parameters, make_steps, se
     """Equation 24 is linear in p(z|s): its maximum over the simplex is one-hot at the label."""
     parameters, steps = make_parameters(seed % 1000, SUB_SKILLS), make_steps(seed, [20])
     densities = log_likelihoods(parameters, steps, sigma).exp()
-    labels = label(part(parameters, "low"), steps)
+    labels = label(Hierarchy.of(parameters).low, steps)
     generator = torch.Generator().manual_seed(seed)
     anything = torch.rand(SUB_SKILLS, 20, generator=generator, dtype=torch.float64).pow(3)
     one_hot = torch.nn.functional.one_hot(labels, SUB_SKILLS).T
@@ -62,30 +68,31 @@ def test_theorem_2_no_assignment_beats_the_label(make_parameters, make_steps, se
     torch.testing.assert_close(best, densities.amax(0))
 
 
-def test_theorem_2_cross_entropy_drives_the_mixture_to_its_maximum(leaves, steps) -> None:
+@pytest.mark.usefixtures("unchecked")
+def test_theorem_2_cross_entropy_drives_the_mixture_to_its_maximum(leaves, steps, gradient_of) -> None:
     """Equation 21's use: log max − log mixture is never above the cross-entropy, and falls to zero with it."""
-    sigma, labels = 0.7, label(part(leaves, "low"), steps)
+    high, low = Hierarchy.of(leaves)
+    sigma, labels = 0.7, label(low, steps)
     maximum = log_likelihoods(leaves, steps, sigma).amax(0).mean()
-    high = part(leaves, "high")
-    optimiser, gaps = torch.optim.Adam(high.values(), lr=0.05), []
+    optimiser, gaps = torch.optim.Adam(itertools.chain(*high), lr=0.05), []
     for _ in range(600):
-        loss = high_level_objective(high, steps, labels, 0.0)
+        of_loss = high_level_slope(high, steps, labels, 0.0)
         gaps.append((maximum - log_mixture(leaves, steps, sigma).mean()).item())
-        assert 0 <= gaps[-1] <= loss.item()
-        optimiser.zero_grad()
-        loss.backward()
+        assert 0 <= gaps[-1] <= of_loss.loss.value.item()
+        for leaf, gradient in zip(itertools.chain(*high), itertools.chain(*gradient_of(of_loss)), strict=True):
+            leaf.grad = gradient
         optimiser.step()
     assert gaps[-1] < 0.01 * gaps[0]
 
 
-def test_theorem_2_the_high_gradients_agree_as_the_sub_skills_get_certain(leaves, steps) -> None:
+def test_theorem_2_the_high_gradients_agree_as_the_sub_skills_get_certain(leaves, steps, gradient_of) -> None:
     """Equation 21 holds in the limit of small σ, where the responsibilities become the labels."""
-    high = part(leaves, "high")
-    loss = high_level_objective(high, steps, label(part(leaves, "low"), steps), 0.0)
-    descent = torch.cat([g.flatten() for g in torch.autograd.grad(loss, list(high.values()))])
+    high, low = Hierarchy.of(leaves)
+    of_loss = high_level_slope(high, steps, label(low, steps), 0.0)
+    descent = torch.cat([gradient.flatten() for gradient in itertools.chain(*gradient_of(of_loss))])
 
     def gap(sigma: float) -> float:
-        gradients = torch.autograd.grad(log_mixture(leaves, steps, sigma).mean(), list(high.values()))
+        gradients = torch.autograd.grad(log_mixture(leaves, steps, sigma).mean(), list(itertools.chain(*high)))
         return ((torch.cat([g.flatten() for g in gradients]) + descent).norm() / descent.norm()).item()
 
     assert gap(1.0) > 0.1
@@ -108,8 +115,8 @@ def test_lemma_1_one_inner_step_ascends_the_log_likelihood(linear, steps) -> Non
     inputs = torch.cat([steps.states, torch.ones(len(steps.states), 1).double()], 1)
     mean, variance = as_matrix(linear), len(inputs) / 2
     ascent = (steps.actions - inputs @ mean.T).T @ inputs / variance
-    adapted = adapt(linear, steps, steps, steps=1, learning_rate=0.05, continuity_weight=0.0)
-    torch.testing.assert_close(as_matrix(adapted.parameters), mean + 0.05 * ascent, rtol=1e-10, atol=1e-12)
+    adapted = adapt(Hierarchy.of(linear), steps, steps, steps=1, learning_rate=0.05, continuity_weight=0.0)
+    torch.testing.assert_close(as_matrix(adapted.hierarchy.parameters), mean + 0.05 * ascent, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("inner_steps", [1, 3, 10])
@@ -125,5 +132,5 @@ def test_lemma_1_early_stopping_is_the_map_estimate_of_a_gaussian_prior(linear, 
     # The posterior's mode: (H + Σ⁻¹) λ = 2/N Xᵀ A + Σ⁻¹ μ.
     data = 2 * inputs.T @ steps.actions / len(inputs)
     mode = torch.linalg.solve(hessian + precision, data + precision @ prior_mean.T).T
-    adapted = adapt(linear, steps, steps, steps=inner_steps, learning_rate=rate, continuity_weight=0.0)
-    torch.testing.assert_close(as_matrix(adapted.parameters), mode, rtol=1e-9, atol=1e-10)
+    adapted = adapt(Hierarchy.of(linear), steps, steps, steps=inner_steps, learning_rate=rate, continuity_weight=0.0)
+    torch.testing.assert_close(as_matrix(adapted.hierarchy.parameters), mode, rtol=1e-9, atol=1e-10)

@@ -1,0 +1,142 @@
+"""Few-shot adaptation and acting on one core: ours against the masked twin, at paper size.
+
+One demonstration of 100 steps, K = 3, width 512. An action reads the weights of the high level and of one sub-skill,
+which do not fit a core's own cache: the time that reading as many bytes takes, and nothing else, is its floor.
+"""
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any, NamedTuple
+
+import torch
+from rich.table import Table
+from torch import Tensor
+
+from benchmarks.masked_twin import MaskedTwin
+from benchmarks.timing import alternate, write_rows
+from benchmarks.workload import OBS_DIM, draw_parameters, draw_steps, settings
+from dmil_core.adaptation import Hierarchy, adapt
+from dmil_core.demonstrations import Standardisation
+from dmil_core.methods.dmil import DmilPolicy
+from services.command_line import exit_code, parse
+from services.progress import console
+
+__all__ = ["Arguments", "run"]
+
+CALLS = 200
+"""Actions are timed by the hundred: one alone is too short."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Arguments of ``benchmarks.adaptation``."""
+
+    sub_skills: int = 3
+    """K."""
+    shots: int = 1
+    """Demonstrations of 100 steps to adapt to."""
+    fine_tuning_steps: int = 50
+    """Steps of adaptation."""
+    rounds: int = 9
+    """How often each is timed; the table shows medians."""
+    json: Path | None = None
+    """Write the rows to this file."""
+
+
+class Contest(NamedTuple):
+    """What is timed, how often in one call, and the most seconds that ours may take once."""
+
+    name: str
+    rivals: dict[str, Callable[[], object]]
+    times: int
+    target: float
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run the benchmark."""
+    given = parse(Arguments, __doc__ or "", arguments, Arguments())
+    torch.set_num_threads(1)
+    rows = [_measure(contest, given.rounds) for contest in _contests(given)]
+    console.print(_table(rows))
+    if given.json:
+        write_rows(given.json, rows)
+        console.print(f"rows: {given.json}")
+
+
+def _contests(given: Arguments) -> list[Contest]:
+    config = settings("paper", given.sub_skills, "second")
+    parameters, support = draw_parameters(config), draw_steps(0, given.shots, 100)
+    steps, rate, weight = given.fine_tuning_steps, 1e-3, config.continuity_weight
+    twin, hierarchy = MaskedTwin(config), Hierarchy.of(parameters)
+
+    def ours() -> Hierarchy:
+        return adapt(hierarchy, support, support, steps=steps, learning_rate=rate, continuity_weight=weight).hierarchy
+
+    def theirs() -> dict[str, Tensor]:
+        return {name: tensor.detach() for name, tensor in twin.adapt(parameters, support, steps, rate).items()}
+
+    policy, adapted = DmilPolicy(ours(), Standardisation.identity(OBS_DIM)), theirs()
+    difference = max((policy.hierarchy.parameters[name] - adapted[name]).abs().max().item() for name in adapted)
+    assert difference < 1e-3, f"ours and the twin differ by {difference}"
+    weights = torch.randn(sum(layer.weight.numel() for layer in (*hierarchy.high, *hierarchy.low[0])))
+
+    def acting(states: int, target: float) -> Contest:
+        observations, memory = draw_steps(1, 1, states).states, policy.start(states)
+        rivals = {
+            "ours": lambda: policy.act(observations.numpy(), memory),
+            "twin": lambda: twin.act(adapted, observations),
+            "floor": lambda: weights.sum(),
+        }
+        return Contest(f"act in {states} state{'s' * (states > 1)}", rivals, CALLS, target)
+
+    adapting = Contest(f"adapt, {given.shots} shot, {steps} steps", {"ours": ours, "twin": theirs}, 1, 1.5)
+    return [adapting, acting(1, 150e-6), acting(20, 500e-6)]
+
+
+def _measure(contest: Contest, rounds: int) -> dict[str, Any]:
+    """Return the row of one contest; seconds are those of one adaptation or one action."""
+
+    def repeated(function: Callable[[], object]) -> Callable[[], object]:
+        return lambda: [function() for _ in range(contest.times)]
+
+    timed = alternate({name: repeated(function) for name, function in contest.rivals.items()}, rounds)
+    seconds = {name: median(spent) / contest.times for name, spent in timed.items()}
+    return {
+        "what": contest.name,
+        "seconds": seconds["ours"],
+        "twin_seconds": seconds["twin"],
+        "ratio": seconds["twin"] / seconds["ours"],
+        "floor_seconds": seconds.get("floor"),
+        "target_seconds": contest.target,
+        "rounds": rounds,
+    }
+
+
+def _table(rows: Sequence[dict[str, Any]]) -> Table:
+    table = Table(title="adaptation and acting on one core")
+    for column in ("what", "ours", "at most", "twin", "faster", "reading the weights"):
+        table.add_column(column, justify="left" if column == "what" else "right")
+    for row in rows:
+        verdict = "met" if row["seconds"] <= row["target_seconds"] else "missed"
+        table.add_row(
+            row["what"],
+            _in_words(row["seconds"]),
+            f"{_in_words(row['target_seconds'])} ({verdict})",
+            _in_words(row["twin_seconds"]),
+            f"{row['ratio']:.2f}x",
+            _in_words(row["floor_seconds"]),
+        )
+    return table
+
+
+def _in_words(seconds: float | None) -> str:
+    if seconds is None:
+        return ""
+    return f"{seconds:.2f} s" if seconds >= 0.1 else f"{seconds * 1e6:.0f} µs"
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(run, sys.argv[1:]))

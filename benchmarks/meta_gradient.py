@@ -1,0 +1,253 @@
+"""The meta-gradient against a masked twin in the plain style, and against the bare matrix products in it.
+
+Three rivals take turns in one run. Ours computes the tasks on two single-threaded worker processes. The twin
+(benchmarks/masked_twin.py) computes them on two threads. The roofline repeats, on the same two workers, every matrix
+product that ours makes, on matrices of the same shapes and layouts, as many as ours and reused in the same order, so
+that the caches are as cold.
+"""
+
+import itertools
+import resource
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from statistics import median
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+import torch
+from rich.table import Table
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from benchmarks.masked_twin import MaskedTwin
+from benchmarks.timing import alternate, write_rows
+from benchmarks.workload import OBS_DIM, Size, draw_parameters, draw_sets, settings
+from dmil_core.configs import DmilConfig
+from dmil_core.meta_gradient import task_gradient
+from services.command_line import exit_code, parse
+from services.progress import Bar, console
+
+__all__ = ["Arguments", "run"]
+
+WORKERS = 2
+TASKS = {"paper": 2, "quick": 10}
+"""Tasks in a batch; a worker computes an equal share of them."""
+TARGETS = {("paper", "second", 3): 2.2, ("paper", "second", 10): 4.3, ("quick", "first", 3): 3.0}
+"""Wanted: at least so many times the twin's speed."""
+ROOFLINE_TARGET = 0.85
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Arguments of ``benchmarks.meta_gradient``."""
+
+    sizes: tuple[Size, ...] = ("paper", "quick")
+    """paper: width 512, 16 trajectories of 100 steps; quick: width 256, 4 windows of 24 steps."""
+    sub_skills: tuple[int, ...] = (3, 10)
+    """K."""
+    orders: tuple[Literal["first", "second"], ...] = ("second", "first")
+    """Of the meta-gradient."""
+    rounds: int = 7
+    """How often each rival is timed; the table shows medians."""
+    json: Path | None = None
+    """Write the rows to this file."""
+
+
+Place: TypeAlias = tuple[int, tuple[int, ...], tuple[int, ...]]
+"""Where a matrix lies in memory: address, shape and strides."""
+
+
+class Product(NamedTuple):
+    """A matrix product."""
+
+    left: Place
+    right: Place
+    result: Place
+    added: bool
+    """Whether it is added to what the result holds."""
+
+
+class ProductRecorder(TorchDispatchMode):
+    """Notes every matrix product."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.products: list[Product] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        name = func.overloadpacket.__name__
+        if name in ("mm", "addmm", "addmm_"):
+            matrices = (*args[-2:], result)
+            places = ((matrix.data_ptr(), tuple(matrix.shape), matrix.stride()) for matrix in matrices)
+            self.products.append(Product(*places, added=name == "addmm_"))
+        return result
+
+
+class Worker:
+    """One of our workers: a share of the tasks on one thread."""
+
+    def __init__(self, config: DmilConfig, size: Size, tasks: Sequence[int]) -> None:
+        self.config, self.parameters = config, draw_parameters(config)
+        self.sets = [draw_sets(size, config, task) for task in tasks]
+        self.products: list[tuple[Tensor, Tensor, Tensor, bool]] = []
+
+    def gradients(self) -> None:
+        """Compute the gradients as a worker does."""
+        for sets in self.sets:
+            task_gradient(self.parameters, *sets, self.config)
+
+    def peak_megabytes(self) -> float:
+        """Return the most memory that this process ever held."""
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+    def record(self) -> float:
+        """Note the matrix products, lay out their operands, and return their floating-point operations."""
+        with ProductRecorder() as recorder:
+            self.gradients()
+        operands: dict[Place, Tensor] = {}
+
+        def operand(place: Place) -> Tensor:
+            _, (rows, columns), stride = place
+            if place not in operands:
+                extent = (rows - 1) * stride[0] + (columns - 1) * stride[1] + 1
+                operands[place] = torch.randn(extent).as_strided((rows, columns), stride)
+            return operands[place]
+
+        self.products = [
+            (operand(product.left), operand(product.right), operand(product.result), product.added)
+            for product in recorder.products
+        ]
+        return sum(2.0 * left.shape[0] * left.shape[1] * right.shape[1] for left, right, _, _ in self.products)
+
+    @torch.no_grad()
+    def bare_products(self) -> None:
+        """Make the same products and nothing else."""
+        for left, right, result, added in self.products:
+            if added:
+                result.addmm_(left, right, alpha=-1e-9)
+            else:
+                torch.mm(left, right, out=result)
+
+
+_worker: Worker
+
+
+def _start(config: DmilConfig, size: Size, tasks: Sequence[int]) -> None:
+    global _worker
+    torch.set_num_threads(1)
+    _worker = Worker(config, size, tasks)
+
+
+def _call(method: str) -> Any:
+    return getattr(_worker, method)()
+
+
+@contextmanager
+def _workers(config: DmilConfig, size: Size) -> Iterator[Callable[[str], list[Any]]]:
+    """Start the workers; yield what calls a method of all of them at once and waits for the results."""
+    shares = [range(index, TASKS[size], WORKERS) for index in range(WORKERS)]
+    with ExitStack() as stack:
+        pools = [
+            stack.enter_context(ProcessPoolExecutor(1, get_context("spawn"), _start, (config, size, share)))
+            for share in shares
+        ]
+
+        def everywhere(method: str) -> list[Any]:
+            return [future.result() for future in [pool.submit(_call, method) for pool in pools]]
+
+        yield everywhere
+
+
+def measure(size: Size, order: Literal["first", "second"], sub_skills: int, rounds: int) -> dict[str, Any]:
+    """Return the row of one configuration; seconds are those of one task."""
+    config, tasks = settings(size, sub_skills, order), TASKS[size]
+    parameters, sets = draw_parameters(config), [draw_sets(size, config, task) for task in range(tasks)]
+    twin = MaskedTwin(config)
+    ours = task_gradient(parameters, *sets[0], config).gradient
+    error = ((ours - (plain := twin.gradient(parameters, sets[0])[0])).norm() / plain.norm()).item()
+    with _workers(config, size) as everywhere:
+        everywhere("gradients")
+        peak = max(everywhere("peak_megabytes"))
+        operations = sum(everywhere("record")) / tasks
+        seconds = alternate(
+            {
+                "ours": lambda: everywhere("gradients"),
+                "twin": lambda: [twin.gradient(parameters, one) for one in sets],
+                "roofline": lambda: everywhere("bare_products"),
+            },
+            rounds,
+        )
+    ours_seconds, twin_seconds, roofline_seconds = (median(seconds[name]) / tasks for name in seconds)
+    return {
+        "size": size,
+        "order": order,
+        "k": sub_skills,
+        "seconds": ours_seconds,
+        "twin_seconds": twin_seconds,
+        "ratio": twin_seconds / ours_seconds,
+        "roofline_seconds": roofline_seconds,
+        "roofline_share": roofline_seconds / ours_seconds,
+        "forwards": operations / _forward_operations(config, len(sets[0][0].states)),
+        "gflops": operations / ours_seconds / 1e9,
+        "peak_mb": peak,
+        "relative_error": error,
+        "rounds": rounds,
+    }
+
+
+def _forward_operations(config: DmilConfig, steps: int) -> float:
+    """Return F, the operations of one network's forward on a task's states, without its narrow last layer."""
+    return 2.0 * steps * config.hidden_units * (OBS_DIM + (config.hidden_layers - 1) * config.hidden_units)
+
+
+def _table(rows: Sequence[dict[str, Any]]) -> Table:
+    table = Table(title=f"one task's meta-gradient: ours on {WORKERS} workers, the twin on {WORKERS} threads")
+    for column in ("size", "order", "K", "ours", "twin", "faster", "of the roofline", "work", "peak", "error"):
+        table.add_column(column, justify="left" if column in ("size", "order") else "right")
+    for row in rows:
+        wanted = TARGETS.get((row["size"], row["order"], row["k"]))
+        share = ROOFLINE_TARGET if row["size"] == "paper" and row["order"] == "second" else None
+        table.add_row(
+            row["size"],
+            row["order"],
+            str(row["k"]),
+            f"{row['seconds'] * 1e3:.1f} ms",
+            f"{row['twin_seconds'] * 1e3:.1f} ms",
+            f"{row['ratio']:.2f}x" + _verdict(row["ratio"], wanted, "x"),
+            f"{row['roofline_share']:.0%}" + _verdict(row["roofline_share"], share, ""),
+            f"{row['forwards']:.0f} F",
+            f"{row['peak_mb']:.0f} MB",
+            f"{row['relative_error']:.0e}",
+        )
+    return table
+
+
+def _verdict(value: float, wanted: float | None, unit: str) -> str:
+    if wanted is None:
+        return ""
+    return f" ({'meets' if value >= wanted else 'misses'} {wanted}{unit})"
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run the benchmark."""
+    given = parse(Arguments, __doc__ or "", arguments, Arguments())
+    torch.set_num_threads(WORKERS)
+    plan = list(itertools.product(given.sizes, given.orders, given.sub_skills))
+    rows = []
+    with Bar("measuring", len(plan)) as bar:
+        for size, order, k in plan:
+            rows.append(measure(size, order, k, given.rounds))
+            bar.advance(1, f"{size}, {order} order, K = {k}")
+    console.print(_table(rows))
+    if given.json:
+        write_rows(given.json, rows)
+        console.print(f"rows: {given.json}")
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(run, sys.argv[1:]))

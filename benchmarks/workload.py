@@ -1,0 +1,48 @@
+"""Synthetic experiments of the sizes that the benchmarks measure: random states and actions, drawn by a seed."""
+
+from typing import Literal, TypeAlias
+
+import torch
+
+from benchmarks.masked_twin import Sets
+from dmil_core.configs import PRESETS, DmilConfig
+from dmil_core.losses import Steps
+from dmil_core.networks import Parameters, initialise
+from dmil_core.seeding import stream
+
+__all__ = ["ACTION_DIM", "OBS_DIM", "Size", "draw_parameters", "draw_sets", "draw_steps", "settings"]
+
+OBS_DIM, ACTION_DIM = 39, 4
+Size: TypeAlias = Literal["paper", "quick"]
+TRAJECTORY_STEPS = {"paper": 100, "quick": 24}
+
+
+def settings(size: Size, sub_skills: int, order: Literal["first", "second"]) -> DmilConfig:
+    """Return a preset's method with other sub-skills and order: width 512 for ``paper``, 256 for ``quick``."""
+    return PRESETS[f"ml10-{size}"].method.model_copy(update={"sub_skills": sub_skills, "order": order})
+
+
+def draw_steps(seed: int, trajectories: int, length: int) -> Steps:
+    """Draw trajectories of one length."""
+    generator = torch.Generator().manual_seed(seed)
+    states = torch.randn(trajectories * length, OBS_DIM, generator=generator)
+    actions = torch.rand(trajectories * length, ACTION_DIM, generator=generator) * 2 - 1
+    return Steps(states, actions, torch.full((trajectories,), length))
+
+
+def draw_sets(size: Size, config: DmilConfig, task: int) -> Sets:
+    """Draw τ1 to τ4 of a task: 16 trajectories of 100 steps for ``paper``, 4 windows of 24 for ``quick``."""
+    one, two, three, four = (
+        draw_steps(4 * task + index, config.trajectories, TRAJECTORY_STEPS[size]) for index in range(4)
+    )
+    return one, two, three, four
+
+
+def draw_parameters(config: DmilConfig) -> Parameters:
+    """Draw He-initialised networks: their labels and choices use several of the sub-skills."""
+    hidden, k = [config.hidden_units] * config.hidden_layers, config.sub_skills
+    draw = stream(0, "benchmark parameters")
+    return {
+        **initialise("high", [OBS_DIM, *hidden, k], draw),
+        **initialise("low", [OBS_DIM, *hidden, ACTION_DIM], draw, copies=k),
+    }

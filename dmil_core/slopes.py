@@ -1,0 +1,113 @@
+"""First and second derivatives of a perceptron's loss as bare matrix products.
+
+Automatic differentiation twice through an inner loop keeps every intermediate of two graphs, writes each gradient out
+and reads it again to take the step. A perceptron is simple enough to do without: a layer's weight gradient is the
+product δᵀx of what came back and what went in, and a product can be subtracted from a weight while it is computed.
+Only the loss as a function of the network's outputs is left to automatic differentiation.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dmil_core.losses import OutputLoss
+from dmil_core.networks import BLOCK, Layer, Network, activations
+
+__all__ = ["Slope", "slope"]
+
+
+class Slope(NamedTuple):
+    """A network's loss at one point of its parameters: the value, the gradient in factors, the curvature."""
+
+    network: Network
+    inputs: list[list[Float[Tensor, "block _"]]]
+    """For each block of steps, what went into each layer, x_l."""
+    deltas: list[list[Float[Tensor, "block _"]]]
+    """The loss's gradient with respect to what each layer put out before its ReLU, δ_l: ∇W_l = Σ δ_lᵀ x_l."""
+    outputs: Float[Tensor, "steps outputs"]
+    loss: OutputLoss
+
+    @torch.no_grad()
+    def add_gradient(self, vector: Network, scale: float = 1.0) -> None:
+        """Add `scale` times the gradient to `vector`, in place."""
+        for inputs, deltas in zip(self.inputs, self.deltas, strict=True):
+            for (weight, bias), value, delta in zip(vector, inputs, deltas, strict=True):
+                weight.addmm_(delta.mT, value, alpha=scale)
+                bias.add_(delta.sum(0), alpha=scale)
+
+    @torch.no_grad()
+    def descend(self, learning_rate: float, *, in_place: bool = False) -> Network:
+        """Return the network after one step of gradient descent; in place, this slope's own network is gone."""
+        stepped = self.network if in_place else tuple(Layer(*map(torch.clone, layer)) for layer in self.network)
+        self.add_gradient(stepped, -learning_rate)
+        return stepped
+
+    @torch.no_grad()
+    def pull_back(self, vector: Network, learning_rate: float) -> None:
+        """Multiply `vector` in place by the Jacobian of `descend`, I − αH, which is symmetric.
+
+        H v is the derivative of the gradient along v (Pearlmutter, "Fast exact multiplication by the Hessian",
+        1994): forward R{z_l} = x_l V_lᵀ + R{x_l} W_lᵀ and backward R{δ_{l-1}} = R{δ_l} W_l + δ_l V_l behind the
+        ReLU's mask, then R{∇W_l} = R{δ_l}ᵀ x_l + δ_lᵀ R{x_l}: six products a layer.
+        """
+        tangents = [_tangents(self.network, vector, inputs) for inputs in self.inputs]
+        changes = self.loss.curvature(torch.cat([block.pop() for block in tangents])).split(BLOCK)
+        for index in reversed(range(len(vector))):
+            blocks = list(zip(changes, self.inputs, self.deltas, tangents, strict=True))
+            if index:
+                changes = [
+                    _masked(
+                        (change @ self.network[index].weight).addmm_(deltas[index], vector[index].weight), inputs[index]
+                    )
+                    for change, inputs, deltas, _ in blocks
+                ]
+            weight, bias = vector[index]
+            for change, inputs, deltas, tangent in blocks:
+                weight.addmm_(change.mT, inputs[index], alpha=-learning_rate)
+                bias.sub_(change.sum(0), alpha=learning_rate)
+                if index:
+                    weight.addmm_(deltas[index].mT, tangent[index - 1], alpha=-learning_rate)
+
+
+@torch.no_grad()
+def slope(
+    network: Network,
+    inputs: Float[Tensor, "steps inputs"],
+    loss: Callable[[Float[Tensor, "steps outputs"]], OutputLoss],
+) -> Slope:
+    """Run a network forward and its loss backward."""
+    values = [activations(network, block) for block in inputs.split(BLOCK)]
+    outputs = torch.cat([block.pop() for block in values])
+    at_outputs = loss(outputs)
+    deltas = [
+        _deltas(network, block, gradient)
+        for block, gradient in zip(values, at_outputs.gradient.split(BLOCK), strict=True)
+    ]
+    return Slope(network, values, deltas, outputs, at_outputs)
+
+
+def _deltas(network: Network, inputs: list[Tensor], gradient: Tensor) -> list[Tensor]:
+    """Return δ_l of each layer from the last layer's."""
+    deltas = [gradient]
+    for (weight, _), value in zip(network[:0:-1], inputs[:0:-1], strict=True):
+        deltas.append(_masked(deltas[-1] @ weight, value))
+    return deltas[::-1]
+
+
+def _tangents(network: Network, vector: Network, inputs: list[Tensor]) -> list[Tensor]:
+    """Return the derivative along `vector` of what each layer puts out, R{x_{l+1}}, and last R{z_L}."""
+    tangents: list[Tensor] = []
+    for index, ((weight, _), (along, along_bias)) in enumerate(zip(network, vector, strict=True)):
+        tangent = torch.addmm(along_bias, inputs[index], along.mT)
+        if index:
+            tangent.addmm_(tangents[-1], weight.mT)
+        tangents.append(_masked(tangent, inputs[index + 1]) if index + 1 < len(network) else tangent)
+    return tangents
+
+
+def _masked(gradient: Tensor, activation: Tensor) -> Tensor:
+    """Multiply in place by the derivative of the ReLU that gave `activation`."""
+    return torch.ops.aten.threshold_backward.grad_input(gradient, activation, 0, grad_input=gradient)
