@@ -7,7 +7,6 @@ that the caches are as cold.
 """
 
 import itertools
-import resource
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -102,8 +101,9 @@ class Worker:
             task_gradient(self.parameters, *sets, self.config)
 
     def peak_megabytes(self) -> float:
-        """Return the most memory that this process ever held."""
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        """Return the most memory that this process ever held; getrusage would count its parent's too."""
+        status = Path("/proc/self/status").read_text()
+        return int(status.partition("VmHWM:")[2].split()[0]) / 1024
 
     def record(self) -> float:
         """Note the matrix products, lay out their operands, and return their floating-point operations."""

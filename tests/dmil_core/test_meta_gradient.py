@@ -1,7 +1,6 @@
 """The outer gradient against a plain twin and against finite differences, and the tree that adds gradients."""
 
 from collections.abc import Callable, Sequence
-from typing import TypeAlias
 
 import pytest
 import torch
@@ -9,68 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.nn import functional
 
+from benchmarks.masked_twin import MaskedTwin, Sets
 from dmil_core.configs import DmilConfig
 from dmil_core.losses import Steps
 from dmil_core.meta_gradient import task_gradient, tree_sum
-from dmil_core.networks import BLOCK, Parameters, flatten, unflatten
+from dmil_core.networks import BLOCK, flatten, unflatten
 
 LENGTHS = ([12, 1, 9], [3, 19], [1, 1, 16, 5], [11, 7])
-Sets: TypeAlias = tuple[Steps, Steps, Steps, Steps]
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
-
-
-class Twin:
-    """Algorithm 1 for one task in plain autograd: every sub-skill on every state, masks, no function of the package."""
-
-    def __init__(self, config: DmilConfig) -> None:
-        self.config, self.unused = config, False
-
-    def network(self, tensors: dict, prefix: str, states: torch.Tensor, k: int | None = None) -> torch.Tensor:
-        layers = sum(name.startswith(prefix) and name.endswith("weight") for name in tensors)
-        for layer in range(layers):
-            weight, bias = tensors[f"{prefix}.{layer}.weight"], tensors[f"{prefix}.{layer}.bias"]
-            states = functional.linear(states, *((weight, bias) if k is None else (weight[k], bias[k])))
-            states = functional.relu(states) if layer < layers - 1 else states
-        return states
-
-    def errors(self, tensors: dict, steps: Steps) -> torch.Tensor:
-        """‖π_k(s_t) − a_t‖², a row for each sub-skill."""
-        skills = range(self.config.sub_skills)
-        return torch.stack(
-            [((self.network(tensors, "low", steps.states, k) - steps.actions) ** 2).sum(1) for k in skills]
-        )
-
-    def high_loss(self, tensors: dict, steps: Steps) -> torch.Tensor:
-        log_p = functional.log_softmax(self.network(tensors, "high", steps.states), dim=1)
-        labels = self.errors(tensors, steps).argmin(dim=0)
-        loss = -(log_p * functional.one_hot(labels, self.config.sub_skills)).sum() / len(labels)
-        switches = [(1 - (p[:-1] * p[1:]).sum(1)).sum() / len(p) for p in log_p.exp().split(steps.lengths.tolist())]
-        return loss + self.config.continuity_weight * sum(switches) / len(switches)
-
-    def low_loss(self, tensors: dict, steps: Steps) -> torch.Tensor:
-        chosen = self.network(tensors, "high", steps.states).argmax(dim=1)
-        mask = functional.one_hot(chosen, self.config.sub_skills).T
-        self.unused |= bool((mask.sum(1) == 0).any())
-        return ((self.errors(tensors, steps) * mask).sum(1) / mask.sum(1).clamp(min=1)).sum()
-
-    def descend(self, tensors: dict, prefix: str, loss: torch.Tensor) -> dict:
-        names = [name for name in tensors if name.startswith(prefix)]
-        gradients = torch.autograd.grad(loss, [tensors[name] for name in names], create_graph=True)
-        if self.config.order == "first":
-            gradients = [gradient.detach() for gradient in gradients]
-        stepped = {n: tensors[n] - self.config.inner_learning_rate * g for n, g in zip(names, gradients, strict=True)}
-        return {**tensors, **stepped}
-
-    def __call__(self, parameters: Parameters, sets: Sets) -> tuple[torch.Tensor, float, float]:
-        """Return the outer gradient and both outer losses."""
-        leaves = {name: tensor.clone().requires_grad_() for name, tensor in parameters.items()}
-        tensors = dict(leaves)
-        for _ in range(self.config.inner_steps):
-            tensors = self.descend(tensors, "high", self.high_loss(tensors, sets[0]))
-            tensors = self.descend(tensors, "low", self.low_loss(tensors, sets[1]))
-        high, low = self.high_loss(tensors, sets[2]), self.low_loss(tensors, sets[3])
-        gradients = torch.autograd.grad(high + low, list(leaves.values()))
-        return torch.cat([gradient.flatten() for gradient in gradients]), high.item(), low.item()
 
 
 def relative_error(got: torch.Tensor, wanted: torch.Tensor) -> float:
@@ -103,7 +48,7 @@ def test_equals_the_plain_twin(
     parameters = make_parameters(sub_skills, sub_skills, dtype=dtype)
     sets = draw_sets(make_steps, dtype)
     got = task_gradient(parameters, *sets, config)
-    gradient, high, low = Twin(config)(parameters, sets)
+    gradient, high, low = MaskedTwin(config).gradient(parameters, sets)
     assert got.gradient.dtype == dtype
     assert relative_error(got.gradient, gradient) <= TOLERANCE[dtype]
     assert got.metrics["high_loss_after"] == pytest.approx(high, rel=TOLERANCE[dtype], abs=TOLERANCE[dtype])
@@ -116,7 +61,7 @@ def test_equals_the_plain_twin(
 def test_equals_the_plain_twin_at_any_depth(make_parameters, make_steps, hidden, order, dtype) -> None:
     config, parameters = settings(3, inner_steps=3, order=order), make_parameters(0, 3, hidden, dtype)
     sets = draw_sets(make_steps, dtype)
-    got, wanted = task_gradient(parameters, *sets, config).gradient, Twin(config)(parameters, sets)[0]
+    got, wanted = task_gradient(parameters, *sets, config).gradient, MaskedTwin(config).gradient(parameters, sets)[0]
     assert relative_error(got, wanted) <= TOLERANCE[dtype]
 
 
@@ -126,7 +71,7 @@ def test_equals_the_plain_twin_on_several_blocks_of_steps(make_parameters, make_
     config, parameters = settings(3, inner_steps=2, order=order), make_parameters(0, 3, dtype=dtype)
     one, two, three, four = (make_steps(seed, [BLOCK // 2, 2 * BLOCK + seed], dtype) for seed in range(4))
     got = task_gradient(parameters, one, two, three, four, config).gradient
-    assert relative_error(got, Twin(config)(parameters, (one, two, three, four))[0]) <= TOLERANCE[dtype]
+    assert relative_error(got, MaskedTwin(config).gradient(parameters, (one, two, three, four))[0]) <= TOLERANCE[dtype]
 
 
 @given(
@@ -142,7 +87,7 @@ def test_equals_the_plain_twin_on_few_states(
     """Sub-skills are left without states in some of the inner steps, in the outer one, or in all."""
     config, parameters = settings(sub_skills, inner_steps=inner_steps, order=order), make_parameters(seed, sub_skills)
     one, two, three, four = (make_steps(seed + index, own) for index, own in enumerate(lengths))
-    gradient, high, low = Twin(config)(parameters, (one, two, three, four))
+    gradient, high, low = MaskedTwin(config).gradient(parameters, (one, two, three, four))
     got = task_gradient(parameters, one, two, three, four, config)
     torch.testing.assert_close(got.gradient, gradient, rtol=1e-9, atol=1e-10)
     assert got.metrics["high_loss_after"] == pytest.approx(high, rel=1e-9, abs=1e-10)
@@ -158,9 +103,8 @@ def test_equals_the_plain_twin_where_only_the_last_sub_skill_is_used(
     parameters = make_parameters(0, sub_skills)
     parameters["high.2.bias"][-1] += 8
     config = settings(sub_skills, continuity_weight=continuity_weight, order=order)
-    twin, got = Twin(config), task_gradient(parameters, *sets, config)
-    assert relative_error(got.gradient, twin(parameters, sets)[0]) <= 1e-10
-    assert twin.unused
+    got = task_gradient(parameters, *sets, config)
+    assert relative_error(got.gradient, MaskedTwin(config).gradient(parameters, sets)[0]) <= 1e-10
     assert got.metrics[f"sub_skill_share/{sub_skills - 1}"] == 1
     unused = unflatten(got.gradient, {name: tensor.shape for name, tensor in parameters.items()})["low.0.weight"][:-1]
     assert torch.equal(unused, torch.zeros_like(unused))
