@@ -19,6 +19,14 @@ def test_the_seconds_are_those_of_the_call():
     assert max(seconds["short"]) < 0.05
 
 
+def test_preparation_comes_before_each_call_and_is_not_timed():
+    calls: list[str] = []
+    rivals = {"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}
+    seconds = alternate(rivals, rounds=2, prepare={"a": lambda: (calls.append("-"), time.sleep(0.05))})
+    assert "".join(calls) == "-abb-a"
+    assert max(seconds["a"]) < 0.05
+
+
 def test_rows_are_read_back_as_written(tmp_path):
     rows = [{"task": "reach", "ratio": 1.5}, {"task": "evaluation", "ratio": 2.0}]
     write_rows(tmp_path / "new" / "rows.json", rows)
