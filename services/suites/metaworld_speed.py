@@ -9,12 +9,15 @@ Observations and success flags are those of Meta-World, bit for bit, and so are 
 ``tests/services/suites/test_metaworld_speed.py`` holds all tasks to that.
 """
 
+import ast
 import copy
+import inspect
 import math
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Callable, Sequence
 from functools import cache, cached_property, lru_cache
 from types import CellType, FunctionType, SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import mujoco as compiled_mujoco
 import numpy as np
@@ -38,9 +41,11 @@ def fast_environment(stock: type[SawyerXYZEnv], *, rewards: bool = False) -> Saw
 
     Args:
         stock: Meta-World's class of the task, of those whose goal is hidden unless one asks.
-        rewards: whether to compute them. Without, a step's reward is NaN and its info holds ``success`` only.
+        rewards: whether to compute them. Without, a step's reward is NaN and its info holds ``success`` only, and of
+            Meta-World's code for rewards no more is run than the statements that success depends on.
     """
-    env: Any = _fast_class(stock, rewards)()
+    env: Any = _fast_class(stock)()
+    env._rewards = rewards
     # As Meta-World's own goal-visible classes do; the observation space would go on to clip the goal to zero.
     env._partially_observable = False
     del env.sawyer_observation_space
@@ -66,6 +71,7 @@ class FastSteps(SawyerXYZEnv):
     """What a fast environment does in place of `SawyerXYZEnv`."""
 
     _rewards: bool
+    _success: Callable[[np.ndarray, np.ndarray], Any]
     _resetting: str | None = None
     _settled_with: bytes | None = None
 
@@ -102,10 +108,10 @@ class FastSteps(SawyerXYZEnv):
         observation, space = self._get_obs(), self.sawyer_observation_space
         np.clip(observation, space.low, space.high, out=observation)
         self._last_stable_obs = observation
-        reward, info = self.evaluate_state(observation, action)
         truncated = self.curr_path_length == self.max_path_length
         if not self._rewards:
-            return observation, math.nan, False, truncated, {"success": info["success"]}
+            return observation, math.nan, False, truncated, {"success": self._success(observation, action)}
+        reward, info = self.evaluate_state(observation, action)
         return observation, reward, False, truncated, info
 
     def _get_obs(self) -> np.ndarray:
@@ -188,23 +194,16 @@ def _compiled(path: str) -> Any:
 
 
 @cache
-def _fast_class(stock: type[SawyerXYZEnv], rewards: bool) -> type[SawyerXYZEnv]:
+def _fast_class(stock: type[SawyerXYZEnv]) -> type[SawyerXYZEnv]:
     """Derive from a class of Meta-World's one that does the same and calls the fast parts."""
-    rebound = type(stock.__name__, (stock,), {})
-    tolerance = _tolerance if rewards else _unread
+    rebound: Any = type(stock.__name__, (stock,), {})
+    fast_utils = SimpleNamespace(**{**vars(reward_utils), "tolerance": _tolerance})
     exchange = Exchange(
         [
             (stock, rebound),  # some methods call static ones by the name of their class
             (Rotation, SimpleNamespace(from_matrix=FastRotation)),
-            (reward_utils.tolerance, tolerance),
-            (
-                reward_utils,
-                SimpleNamespace(
-                    tolerance=tolerance,
-                    hamacher_product=reward_utils.hamacher_product if rewards else _unread,
-                    rect_prism_tolerance=reward_utils.rect_prism_tolerance if rewards else _unread,
-                ),
-            ),
+            (reward_utils, fast_utils),
+            (reward_utils.tolerance, _tolerance),
         ]
     )
     for parent in (SawyerXYZEnv, stock):
@@ -213,9 +212,8 @@ def _fast_class(stock: type[SawyerXYZEnv], rewards: bool) -> type[SawyerXYZEnv]:
                 setattr(rebound, name, exchange.rebind(member))
             elif isinstance(member, staticmethod):
                 setattr(rebound, name, staticmethod(exchange.rebind(member.__func__)))
-    if not rewards:
-        rebound._gripper_caging_reward = _unread
-    return type(stock.__name__, (FastSteps, rebound), {"_rewards": rewards})
+    rebound._success, rebound._success_terms = success_functions(rebound)
+    return type(stock.__name__, (FastSteps, rebound), {})
 
 
 class Exchange:
@@ -243,11 +241,6 @@ class Exchange:
         return next((new for old, new in self._exchanged if value is old), value)
 
 
-def _unread(*arguments: Any, **options: Any) -> float:
-    """Stand in for a part of the reward that nobody reads: NaN would show itself wherever it got."""
-    return math.nan
-
-
 def _tolerance(
     x: Any,
     bounds: tuple[float, float] = (0.0, 0.0),
@@ -273,6 +266,85 @@ class FastRotation(NamedTuple):
     def as_quat(self) -> Float64[np.ndarray, " 4"]:
         """Return the quaternion (x, y, z, w)."""
         return quaternion(self.matrix)
+
+
+def success_functions(task: type[SawyerXYZEnv]) -> tuple[FunctionType, FunctionType]:
+    """Cut what success depends on out of a task's ``evaluate_state`` and the ``compute_reward`` that it calls.
+
+    Meta-World computes both in one, and success needs one distance of it. Statements are kept whole or not at all.
+
+    Returns:
+        The methods ``_success`` and ``_success_terms``, which take what the two take. The latter is called by the
+        former, and returns None in place of the terms that success does not need.
+    """
+    evaluate = cast(Any, task.evaluate_state).__closure__[0].cell_contents  # the decorator asks for `set_task`
+    compute = cast(Any, task).compute_reward
+    evaluation, computation = _definition(evaluate), _definition(compute)
+    info: Any = next(node for node in ast.walk(evaluation) if isinstance(node, ast.Dict))
+    success = next(value for key, value in zip(info.keys, info.values, strict=True) if ast.unparse(key) == "'success'")
+    at = next(index for index, line in enumerate(evaluation.body) if "self.compute_reward(" in ast.unparse(line))
+    call: Any = evaluation.body[at]
+    after, needed = _needed_for([*evaluation.body[at + 1 : -1], ast.Return(success)], set())
+    wanted = [not needed.isdisjoint(_names(term)) for term in call.targets[0].elts]
+    call.value.func.attr = "_success_terms"
+    before, _ = _needed_for(evaluation.body[:at], needed)
+    evaluation.body = [*before, call, *after] if any(wanted) else [*before, *after]
+    current: Any = next(
+        line for line in computation.body if "self.reward_function_version == 'v2'" in ast.unparse(line)
+    )
+    terms = current.body[-1].value
+    if len(terms.elts) == len(wanted):  # of two tasks that return otherwise, all terms stay
+        terms.elts = [term if want else ast.Constant(None) for term, want in zip(terms.elts, wanted, strict=True)]
+    computation.body, _ = _needed_for(current.body, set())
+    return _compiled_as(evaluation, evaluate), _compiled_as(computation, compute)
+
+
+def _definition(function: FunctionType) -> ast.FunctionDef:
+    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(function))).body
+    assert isinstance(definition, ast.FunctionDef)
+    return definition
+
+
+def _compiled_as(definition: ast.FunctionDef, function: FunctionType) -> FunctionType:
+    """Compile a definition where `function` stands, without decorators and annotations."""
+    definition.decorator_list, definition.returns = [], None
+    for argument in definition.args.args:
+        argument.annotation = None
+    module = ast.fix_missing_locations(ast.Module([definition], []))
+    made: dict[str, FunctionType] = {}
+    exec(compile(module, function.__code__.co_filename, "exec"), function.__globals__, made)
+    return made[definition.name]
+
+
+def _needed_for(lines: Sequence[ast.stmt], needed: set[str]) -> tuple[list[ast.stmt], set[str]]:
+    """Return the statements that `needed`, or what is returned, depends on, and all names in them."""
+    kept: list[ast.stmt] = []
+    for line in reversed(lines):
+        if isinstance(line, ast.If):
+            then, for_then = _needed_for(line.body, needed)
+            otherwise, for_otherwise = _needed_for(line.orelse, needed)
+            if then or otherwise:
+                kept = [ast.If(line.test, then or [ast.Pass()], otherwise), *kept]
+                needed = needed | for_then | for_otherwise | _names(line.test)
+        elif isinstance(line, ast.Return) or not needed.isdisjoint(_assigned(line)):
+            kept, needed = [line, *kept], needed | _names(line)
+    return kept, needed
+
+
+def _assigned(line: ast.stmt) -> set[str]:
+    """Return the names that a statement may change; only the kinds that Meta-World's rewards are made of are known."""
+    if isinstance(line, ast.Assign):
+        return set().union(*map(_names, line.targets))
+    if isinstance(line, ast.AnnAssign | ast.AugAssign):
+        return _names(line.target)
+    assert isinstance(line, ast.Assert | ast.Expr | ast.Delete), f"a statement of an unknown kind: {ast.unparse(line)}"
+    return set()
+
+
+def _names(node: ast.AST) -> set[str]:
+    """Return all names in a piece of code, with their attributes, but ``self`` alone."""
+    parts = (part for part in ast.walk(node) if isinstance(part, ast.Name | ast.Attribute))
+    return {ast.unparse(part) for part in parts} - {"self"}
 
 
 def quaternion(matrix: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 4"]:
