@@ -293,7 +293,7 @@ def success_functions(task: type[SawyerXYZEnv]) -> tuple[FunctionType, FunctionT
         line for line in computation.body if "self.reward_function_version == 'v2'" in ast.unparse(line)
     )
     terms = current.body[-1].value
-    if len(terms.elts) == len(wanted):  # of two tasks that return otherwise, all terms stay
+    if len(terms.elts) == len(wanted):  # two tasks return in another form: of these all terms stay
         terms.elts = [term if want else ast.Constant(None) for term, want in zip(terms.elts, wanted, strict=True)]
     computation.body, _ = _needed_for(current.body, set())
     return _compiled_as(evaluation, evaluate), _compiled_as(computation, compute)
