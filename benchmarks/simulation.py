@@ -3,7 +3,8 @@
 Steps: for each task the expert's episodes are recorded once. Then the stock environment and ours execute the recorded
 actions, and bare physics (``mj_step`` for the same number of steps) the very same controls from the same states, in
 alternation. Evaluations: the same policy for the same numbers of tasks and episodes, and the same horizon, through
-``metaworld.evaluation`` on Meta-World's own asynchronous vector environment, and through this project's runner.
+``metaworld.evaluation`` on Meta-World's own asynchronous vector environment, and through this project's simulation
+workers, one process for each core.
 Everything shares the cores that the process may use, so ``taskset -c 0`` measures one core.
 """
 
@@ -11,8 +12,10 @@ import os
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
@@ -32,8 +35,8 @@ from dmil_core.methods.base import FineTuning, Policy
 from dmil_core.methods.dmil import Dmil
 from dmil_core.networks import Parameters, flatten
 from dmil_core.seeding import stream
+from services.actors.simulation import SimulationWorker
 from services.command_line import exit_code, parse
-from services.experiment import open_runner
 from services.progress import console
 from services.rollouts import TrialOutcome, demonstrate, trials
 from services.suites.metaworld import SPLITS, MetaWorldSuite, SeededEpisodes
@@ -233,6 +236,9 @@ def steps_table(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 # Whole evaluations
 
+worker: SimulationWorker
+"""Of a process that rolls out, once it has started."""
+
 
 class StockAgent:
     """A policy as Meta-World's evaluation wants it; counts its calls and their seconds."""
@@ -278,6 +284,17 @@ def one_policy(
     return method, policy.parameters, demonstrations
 
 
+def start_worker(suite: MetaWorldSuite) -> None:
+    """Make this process's simulation worker."""
+    global worker
+    worker = SimulationWorker(suite)
+
+
+def try_out(call: tuple[Any, ...]) -> TrialOutcome:
+    """Let this process's simulation worker adapt and roll out one trial."""
+    return worker.try_out(*call)
+
+
 def evaluation_row(given: Arguments) -> dict[str, Any]:
     """Time whole evaluations of one policy, Meta-World's and ours, in alternation."""
     cores = len(os.sched_getaffinity(0))
@@ -303,14 +320,15 @@ def evaluation_row(given: Arguments) -> dict[str, Any]:
         agents.append(StockAgent(policy))
         metaworld.evaluation.evaluation(agents[-1], envs, episodes)
 
-    with open_runner("local" if cores == 1 else "ray", suite, cores) as runner:
+    # Processes that live on, as those of the vector environment do; an actor of Ray does this work in an experiment.
+    with ProcessPoolExecutor(cores, get_context("spawn"), start_worker, (suite,)) as pool:
 
         def ours() -> None:
             calls = [(method, flat, shapes, trial, demonstrations[trial.task], settings, 0) for trial in plan]
-            outcomes[:] = [outcome for _, outcome in runner.simulate("try_out", calls)]
+            outcomes[:] = pool.map(try_out, calls)
 
         both = {"stock": stock, "ours": ours}
-        alternate(both, 1)  # builds all environments
+        alternate(both, 1)  # builds the environments
         agents.clear()
         times = alternate(both, given.evaluation_rounds)
     envs.close()
