@@ -9,12 +9,17 @@ from typing import Any
 __all__ = ["alternate", "write_rows"]
 
 
-def alternate(functions: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
+def alternate(
+    functions: Mapping[str, Callable[[], object]],
+    rounds: int,
+    prepare: Mapping[str, Callable[[], object]] | None = None,
+) -> dict[str, list[float]]:
     """Time rivals in alternation, so that whatever else the machine does meets all of them alike.
 
     Args:
         functions: the rivals by name, each without arguments.
         rounds: how often each is called; every other round goes backwards, so that none always follows the same.
+        prepare: what is to be called before each call of the rival of that name, untimed.
 
     Returns:
         For each name the wall-clock seconds of its calls, in order: take medians, and ratios of medians.
@@ -23,6 +28,8 @@ def alternate(functions: Mapping[str, Callable[[], object]], rounds: int) -> dic
     for number in range(rounds):
         order = list(functions) if number % 2 == 0 else list(functions)[::-1]
         for name in order:
+            if prepare is not None and name in prepare:
+                prepare[name]()
             start = time.perf_counter()
             functions[name]()
             seconds[name].append(time.perf_counter() - start)

@@ -45,26 +45,26 @@ class Episode(NamedTuple):
 def rollout(policy: Policy, envs: Sequence[Environment], seeds: Sequence[int], horizon: int) -> list[Episode]:
     """Run one episode for each seed, each in an environment of its own, with one call of the policy a step for all.
 
+    The environments are of one task.
+
     An episode ends at its first success, or after `horizon` steps without one; a policy that diverged, so that an
     action is not finite, fails there and then.
     """
-    observations, goals = [], []
-    for env, seed in zip(envs, seeds, strict=True):
-        observation, info = env.reset(seed=seed)
-        observations.append(observation)
-        goals.append(info["goal"])
+    resets = [env.reset(seed=seed) for env, seed in zip(envs, seeds, strict=True)]
+    goals = [info["goal"] for _, info in resets]
+    observations = np.array([observation for observation, _ in resets], np.float32)
     alive = np.arange(len(seeds))
     memory = policy.start(len(seeds))
     success = np.zeros(len(seeds), bool)
     choices: list[list[int]] = [[] for _ in seeds]
     for _ in range(horizon):
-        decision = policy.act(np.asarray(observations, np.float32)[alive], memory)
+        decision = policy.act(observations[alive], memory)
         finite = np.isfinite(decision.actions).all(axis=1)
-        acting = alive[finite].tolist()
-        for index, action, sub_skill in zip(acting, decision.actions[finite], decision.sub_skills[finite], strict=True):
-            observations[index], _, _, _, info = envs[index].step(_clip(action, envs[index]))
+        acting, actions = alive[finite].tolist(), _clip(decision.actions[finite], envs[0])
+        for index, action, sub_skill in zip(acting, actions, decision.sub_skills[finite].tolist(), strict=True):
+            observations[index], _, _, _, info = envs[index].step(action)
             success[index] = info["success"]
-            choices[index].append(int(sub_skill))
+            choices[index].append(sub_skill)
         going_on = ~success[alive] & finite
         alive, memory = alive[going_on], decision.memory[going_on]
         if not len(alive):
@@ -101,10 +101,10 @@ def demonstrate(
     return Attempt(seed, goal, solved_at, np.asarray(observations, np.float32), np.asarray(actions, np.float32))
 
 
-def _clip(action: np.ndarray, env: Environment) -> np.ndarray:
+def _clip(actions: np.ndarray, env: Environment) -> np.ndarray:
     space = env.action_space
     assert isinstance(space, Box)
-    return np.clip(action, space.low, space.high)
+    return np.clip(actions, space.low, space.high)
 
 
 def trials(tasks: Sequence[tuple[Split, str]], evaluation: EvaluationConfig) -> list[Trial]:

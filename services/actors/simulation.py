@@ -17,21 +17,28 @@ from services.suites.base import Attempt, Environment, TaskSuite
 __all__ = ["SimulationWorker"]
 
 
+ENVIRONMENTS_KEPT = 40
+"""At most so many environments stay built in a worker, 24 MB each in Meta-World."""
+
+
 class SimulationWorker:
-    """Builds a task's environments once and uses them again; an episode depends on its seed alone."""
+    """Builds environments once and uses them again; an episode depends on its seed alone."""
 
     def __init__(self, suite: TaskSuite) -> None:
         """Simulate the tasks of `suite`."""
         torch.set_num_threads(1)
         self._suite = suite
-        self._task: str | None = None
-        self._envs: list[Environment] = []
+        self._envs: dict[str, list[Environment]] = {}
 
     def _environments(self, task: str, count: int) -> list[Environment]:
-        if task != self._task:
-            self._task, self._envs = task, []
-        self._envs += [self._suite.make_env(task) for _ in range(count - len(self._envs))]
-        return self._envs
+        """Return at least `count` environments of a task; those of the tasks longest unused make room."""
+        envs = self._envs.pop(task, [])
+        while self._envs and max(count, len(envs)) + sum(map(len, self._envs.values())) > ENVIRONMENTS_KEPT:
+            for env in self._envs.pop(next(iter(self._envs))):
+                env.close()
+        envs += [self._suite.make_env(task) for _ in range(count - len(envs))]
+        self._envs[task] = envs
+        return envs
 
     def attempts(self, task: str, numbers: Sequence[int], config: DemonstrationConfig) -> list[Attempt]:
         """Let the expert try, once for each of `numbers`, which name the attempts."""

@@ -5,12 +5,13 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
+from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from metaworld.policies import ENV_POLICY_MAP
 
 from dmil_core.configs import SuiteConfig
 from dmil_core.errors import UserError
 from services.suites.base import Environment, Expert
+from services.suites.metaworld_speed import fast_environment
 
 __all__ = ["SPLITS", "MetaWorldSuite", "UnknownTaskError"]
 
@@ -71,12 +72,9 @@ class MetaWorldSuite:
             if unknown := [task for task in tasks if task not in known]:
                 raise UnknownTaskError(f"suite.{field}: got {', '.join(unknown)}; wanted some of {', '.join(known)}")
 
-    def make_env(self, task: str) -> Environment:
-        """Build a task's environment from the goal-observable class; switching that later leaves goals at zero."""
-        env: Any = ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{task}-v3-goal-observable"]()
-        env.seeded_rand_vec = True
-        env._freeze_rand_vec = False
-        return SeededEpisodes(env)
+    def make_env(self, task: str, *, rewards: bool = False) -> Environment:
+        """Build a task's environment, made fast; unless asked for, its rewards are NaN and its info is ``success``."""
+        return SeededEpisodes(fast_environment(ALL_V3_ENVIRONMENTS[f"{task}-v3"], rewards=rewards))
 
     def expert(self, task: str) -> Expert:
         """Return Meta-World's own scripted policy."""
