@@ -1,0 +1,25 @@
+"""Rivals are timed in alternation, and rows come back as they were written."""
+
+import json
+import time
+
+from benchmarks.timing import alternate, write_rows
+
+
+def test_rivals_take_turns_and_every_other_round_goes_backwards():
+    calls: list[str] = []
+    seconds = alternate({name: lambda name=name: calls.append(name) for name in "abc"}, rounds=3)
+    assert "".join(calls) == "abccbaabc"
+    assert {name: len(times) for name, times in seconds.items()} == {"a": 3, "b": 3, "c": 3}
+
+
+def test_the_seconds_are_those_of_the_call():
+    seconds = alternate({"long": lambda: time.sleep(0.05), "short": lambda: None}, rounds=2)
+    assert min(seconds["long"]) >= 0.05
+    assert max(seconds["short"]) < 0.05
+
+
+def test_rows_are_read_back_as_written(tmp_path):
+    rows = [{"task": "reach", "ratio": 1.5}, {"task": "evaluation", "ratio": 2.0}]
+    write_rows(tmp_path / "new" / "rows.json", rows)
+    assert json.loads((tmp_path / "new" / "rows.json").read_text()) == rows
