@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from rich.box import SIMPLE
 from rich.table import Table
 
 from benchmarks.cluster_model import Costs, Network, Prediction, calls_of_a_tree, predict
@@ -169,9 +170,9 @@ def misses(rows: Sequence[Row]) -> list[str]:
 
 def table(rows: Sequence[Row]) -> Table:
     """Lay the rows out for the terminal."""
-    view = Table(title="Iterations of meta-training: medians; milliseconds and megabytes of one iteration")
+    view = Table(title="Medians of iterations: milliseconds, and MB of parameters and gradients", box=SIMPLE)
     columns = ("size", "runner", "workers", "iterations/s", "speedup", "overhead")
-    for column in (*columns, *Timing._fields, "parameters", "gradients"):
+    for column in (*columns, *Timing._fields, "MB out", "MB in"):
         view.add_column(column, justify="left" if column in ("size", "runner") else "right")
     for row in rows:
         view.add_row(
@@ -248,8 +249,8 @@ def predictions(costs: Costs, most: int, *, weak: bool, relayed: bool) -> list[P
 
 def prediction_table(title: str, found: Sequence[Prediction]) -> Table:
     """Lay predictions out for the terminal; efficiency is against one worker."""
-    view = Table(title=title)
-    for column in ("workers", *Prediction._fields[1:], "iteration", "efficiency", "largest besides compute"):
+    view = Table(title=title, box=SIMPLE)
+    for column in ("workers", *Prediction._fields[1:], "iteration", "efficiency", "largest overhead"):
         view.add_column(column, justify="right")
     one = found[0]
     for this in found:
