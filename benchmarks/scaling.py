@@ -28,6 +28,7 @@ from dmil_core.methods.dmil import Dmil
 from dmil_core.networks import flatten
 from dmil_core.outer_loop import OuterState, add
 from dmil_core.seeding import stream
+from services.actors.freight import pack
 from services.command_line import exit_code, parse
 from services.progress import console
 from services.ray_runner import FAN_IN, RayMetaTraining, RayRunner
@@ -201,7 +202,7 @@ def measured_costs(training: RayMetaTraining, timings: Sequence[Timing], slots: 
 
     parameters = training.state().parameters
     pool = training._pool
-    small = np.zeros(1, np.float32)
+    small = [np.zeros(1, np.float32)]
 
     def seconds(work: Callable[[], object]) -> float:
         began = time.perf_counter()
@@ -225,7 +226,7 @@ def measured_costs(training: RayMetaTraining, timings: Sequence[Timing], slots: 
         call=float(np.median([seconds(call) for _ in range(CALLS // 4)])),
         submit=seconds(many) / CALLS,
         buffer=parameters.nbytes,
-        store=parameters.nbytes / float(np.median([seconds(lambda: ray.put(parameters)) for _ in range(10)])),
+        store=parameters.nbytes / float(np.median([seconds(lambda: ray.put(pack(parameters))) for _ in range(10)])),
         add=FAN_IN
         * parameters.nbytes
         / float(np.median([seconds(lambda: add([parameters] * FAN_IN)) for _ in range(5)])),

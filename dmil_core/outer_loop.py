@@ -127,7 +127,7 @@ class OuterStep:
         """
         self._parameters = torch.nn.Parameter(torch.tensor(state.parameters))
         self._clip = gradient_clip
-        self._adam = torch.optim.Adam([self._parameters], lr=learning_rate)
+        self._adam = torch.optim.Adam([self._parameters], lr=learning_rate, fused=True)
         self._adam.state[self._parameters] = {
             "step": torch.tensor(float(state.iteration)),
             "exp_avg": torch.tensor(state.first_moment),

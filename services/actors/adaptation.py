@@ -4,14 +4,13 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
-from jaxtyping import Float32
 
 from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import MetaLearner
 from dmil_core.networks import unflatten
 from dmil_core.outer_loop import add, group_gradient
+from services.actors.freight import Freight, pack, unpack
 from services.timing import Span
 
 __all__ = ["AdaptationWorker", "BlockReport"]
@@ -41,31 +40,31 @@ class AdaptationWorker:
 
     def gradient(
         self,
-        parameters: Float32[np.ndarray, " size"],
+        parameters: Freight,
         iteration: int,
         tasks: Sequence[str],
         block: Sequence[Sequence[int]],
-    ) -> tuple[BlockReport, Float32[np.ndarray, " size"]]:
+    ) -> tuple[BlockReport, Freight]:
         """Return the sum of a block's gradients, which is all that need travel, and its report.
 
         Args:
-            parameters: may lie in memory that other processes read: they are copied first.
+            parameters: flat; they are copied first.
             iteration: counts from 0.
             tasks: of every slot of the iteration.
             block: the slots of each of its groups.
         """
         began = time.perf_counter()
-        own = unflatten(torch.tensor(parameters), self._shapes)
+        own = unflatten(torch.from_numpy(unpack(parameters)), self._shapes)
         results = [
             group_gradient(self._method, self._demonstrations, own, self._seed, iteration, tasks, slots)
             for slots in block
         ]
         gradient = add([result.gradient for result in results])
         metrics = [slot for result in results for slot in result.metrics]
-        return BlockReport(metrics, Span(began, time.perf_counter())), gradient
+        return BlockReport(metrics, Span(began, time.perf_counter())), pack(gradient)
 
-    def add(self, *gradients: Float32[np.ndarray, " size"]) -> tuple[Span, Float32[np.ndarray, " size"]]:
+    def add(self, *gradients: Freight) -> tuple[Span, Freight]:
         """Return the sum of neighbouring gradients of the tree, and when it was made."""
         began = time.perf_counter()
-        total = add(gradients)
+        total = [add(pieces) for pieces in zip(*gradients, strict=True)]
         return Span(began, time.perf_counter()), total

@@ -3,12 +3,11 @@
 import time
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from jaxtyping import Float32
 
 from dmil_core.configs import TrainingConfig
 from dmil_core.outer_loop import OuterState, OuterStep
+from services.actors.freight import Freight, pack, unpack
 from services.timing import Span
 
 __all__ = ["Learner", "StepReport"]
@@ -30,14 +29,14 @@ class Learner:
         torch.set_num_threads(1)
         self._step = OuterStep(state, training.learning_rate, training.gradient_clip)
 
-    def parameters(self) -> tuple[float, Float32[np.ndarray, " size"]]:
+    def parameters(self) -> tuple[float, Freight]:
         """Return the time on this machine's clock, and the current parameters, flat."""
-        return time.perf_counter(), self._step.parameters.numpy().copy()
+        return time.perf_counter(), pack(self._step.parameters.numpy().copy())
 
-    def step(self, gradient: Float32[np.ndarray, " size"]) -> tuple[StepReport, Float32[np.ndarray, " size"]]:
+    def step(self, gradient: Freight) -> tuple[StepReport, Freight]:
         """Step by the sum of all gradients; return the report and the new parameters."""
         began = time.perf_counter()
-        norm = self._step(gradient)
+        norm = self._step(unpack(gradient))
         ended, parameters = self.parameters()
         return StepReport(norm, Span(began, ended)), parameters
 

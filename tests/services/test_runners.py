@@ -14,6 +14,7 @@ from dmil_core.configs import ExperimentConfig
 from dmil_core.networks import flatten
 from dmil_core.outer_loop import OuterState, groups
 from services.actors.adaptation import AdaptationWorker
+from services.actors.freight import PIECE, pack, unpack
 from services.actors.learner import Learner
 from services.demo_store import DemoStore
 from services.experiment import Experiment, open_runner
@@ -185,7 +186,7 @@ def test_the_learner_receives_one_gradient(
 ):
     class Strict(Learner):
         def step(self, gradient):
-            assert gradient.shape == self.parameters()[1].shape
+            assert [len(piece) for piece in gradient] == [len(piece) for piece in self.parameters()[1]]
             return super().step(gradient)
 
     monkeypatch.setattr("services.ray_runner.Learner", Strict)
@@ -193,6 +194,15 @@ def test_the_learner_receives_one_gradient(
     with open_runner("ray", experiment.suite, workers):
         meta_training = RayMetaTraining(plan_of(experiment, data), workers, fan_in=2)
         assert follow(meta_training).numbers == list(range(1, ITERATIONS + 1))
+
+
+@pytest.mark.parametrize("size", [1, PIECE, PIECE + 1, 3 * PIECE])
+def test_what_is_packed_arrives_as_it_was(size: int):
+    vector = np.random.default_rng(0).normal(size=size).astype(np.float32)
+    packed = pack(vector)
+    assert all(len(piece) <= PIECE for piece in packed)
+    assert np.array_equal(unpack(packed), vector)
+    assert not any(np.shares_memory(piece, unpack(packed)) for piece in packed)
 
 
 def test_the_time_of_an_iteration_is_divided_up_whole():
