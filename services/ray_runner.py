@@ -184,12 +184,26 @@ class RayMetaTraining:
     def _gradients(self, iteration: int) -> list["Call"]:
         """Have the gradient of each block computed."""
         tasks = self._plan.tasks(iteration)
-        return [
-            self._pool.submit("gradient", self._parameters, iteration, tasks, block, returns=2) for block in self.blocks
-        ]
+        calls: list[Call] = []
+        for index, block in enumerate(self.blocks):
+            part = calls[index - index % self._fan_in :] if self._one_block_each else []
+            last = len(part) == self._fan_in - 1 or index == len(self.blocks) - 1
+            before = part if last else []
+            calls.append(self._pool.submit("gradient", self._parameters, iteration, tasks, block, before, returns=2))
+        return calls
+
+    @property
+    def _one_block_each(self) -> bool:
+        """Whether all blocks are computed side by side: then the last of each few adds the others itself.
+
+        That saves a hop. Where blocks wait for a worker, none should stand and wait for another's gradient.
+        """
+        return len(self.blocks) <= len(self)
 
     def _add(self, gradients: Sequence["Call"]) -> "Call":
         """Have gradients added by the workers that computed the last of each few, until one is left."""
+        if self._one_block_each:
+            gradients = [*gradients[self._fan_in - 1 : -1 : self._fan_in], gradients[-1]]
         while len(gradients) > 1:
             parts = [gradients[first : first + self._fan_in] for first in range(0, len(gradients), self._fan_in)]
             gradients = [

@@ -44,6 +44,7 @@ class AdaptationWorker:
         iteration: int,
         tasks: Sequence[str],
         block: Sequence[Sequence[int]],
+        before: Sequence[Any] = (),
     ) -> tuple[BlockReport, Freight]:
         """Return the sum of a block's gradients, which is all that need travel, and its report.
 
@@ -52,6 +53,7 @@ class AdaptationWorker:
             iteration: counts from 0.
             tasks: of every slot of the iteration.
             block: the slots of each of its groups.
+            before: Ray's references to the gradients of the blocks just before, which are then added.
         """
         began = time.perf_counter()
         own = unflatten(torch.from_numpy(unpack(parameters)), self._shapes)
@@ -61,7 +63,13 @@ class AdaptationWorker:
         ]
         gradient = add([result.gradient for result in results])
         metrics = [slot for result in results for slot in result.metrics]
-        return BlockReport(metrics, Span(began, time.perf_counter())), pack(gradient)
+        report = BlockReport(metrics, Span(began, time.perf_counter()))
+        if not before:
+            return report, pack(gradient)
+        import ray  # the local runner, which never comes here, does without
+
+        _, total = self.add(*ray.get(list(before)), pack(gradient))
+        return report, total
 
     def add(self, *gradients: Freight) -> tuple[Span, Freight]:
         """Return the sum of neighbouring gradients of the tree, and when it was made."""

@@ -23,7 +23,8 @@ class NoRoomError(UserError):
 class Call:
     """One call of an actor's method: where it runs, and what came of it.
 
-    Among the arguments of another call it stands for its last result, which need not be there yet.
+    Among the arguments of another call it stands for its last result, which need not be there yet. In a list among them
+    it stands for the reference to that: the other call begins without it, and fetches it when it needs it.
     """
 
     def __init__(
@@ -45,7 +46,8 @@ class Call:
     @property
     def can_begin(self) -> bool:
         """Whether all that it builds upon is under way."""
-        return all(argument.references for argument in self.arguments if isinstance(argument, Call))
+        calls = (call for given in self.arguments for call in (given if isinstance(given, list) else [given]))
+        return all(call.references for call in calls if isinstance(call, Call))
 
 
 class Pool:
@@ -93,7 +95,7 @@ class Pool:
 
         Args:
             method: of the actors.
-            arguments: values, object references, or calls, which stand for their last result.
+            arguments: values, object references, calls or lists of calls, see `Call`.
             returns: how many results it has. The first is fetched, the others stay object references.
             beside: the call on whose actor it is to run, however busy that is; by default the least busy one.
             on: an actor that is not the pool's, and is not replaced if it dies.
@@ -170,8 +172,9 @@ class Pool:
     def _send(self, call: Call) -> None:
         if call.worker is not None:
             call.actor = self._actors[call.worker]
-        arguments = [given.references[-1] if isinstance(given, Call) else given for given in call.arguments]
-        references = getattr(call.actor, call.method).options(num_returns=call.returns).remote(*arguments)
+        references = (
+            getattr(call.actor, call.method).options(num_returns=call.returns).remote(*map(_now, call.arguments))
+        )
         call.references = [references] if call.returns == 1 else references
         self._running[call.references[0]] = call
 
@@ -197,3 +200,10 @@ class Pool:
             ray.kill(call.actor)  # one that is only out of reach would keep its place
             self._actors[call.worker] = self._make()
             self.restarts += 1
+
+
+def _now(given: Any) -> Any:
+    """Return what is sent for an argument."""
+    if isinstance(given, Call):
+        return given.references[-1]
+    return [_now(part) for part in given] if isinstance(given, list) else given

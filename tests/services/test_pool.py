@@ -29,6 +29,9 @@ def make(joined) -> Iterator:
         def add(self, *numbers: int) -> tuple[int, int]:
             return os.getpid(), sum(numbers)
 
+        def fetch(self, numbers: list[ray.ObjectRef]) -> int:
+            return sum(ray.get(numbers))
+
         def die(self, folder: Path, deaths: int, number: int) -> tuple[int, int]:
             """Die so many times, and then return the number."""
             before = len(list(folder.iterdir()))
@@ -63,6 +66,15 @@ def test_calls_build_upon_calls_that_are_under_way(make, ahead: int):
     assert [pool.result(call) for call in numbers] == [f"made {number}" for number in range(5)]
     pids = [ray.get(actor.__ray_call__.remote(lambda counter: os.getpid())) for actor in pool._actors]
     assert [pids.index(pool.result(call)) for call in sums] == [numbers[1].worker, numbers[4].worker]
+    pool.close()
+
+
+def test_a_list_of_calls_is_fetched_by_the_actor_itself(make):
+    pool = Pool(make, 2, ahead=2)
+    numbers = [pool.submit("two", number, returns=2) for number in range(3)]
+    total = pool.submit("fetch", numbers)
+    assert pool.result(total) == 3
+    assert pool.result(pool.submit("fetch", [])) == 0
     pool.close()
 
 

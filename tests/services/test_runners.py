@@ -80,6 +80,7 @@ def cut(groups: int, size: int) -> list[slice]:
     return [slice(first, first + size) for first in range(0, groups, size)]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("joined")
 @pytest.mark.parametrize(("slots", "group"), [(5, 1), (7, 3)])
 def test_any_number_of_workers_ends_with_the_same_bits(config, store: DemoStore, data, slots: int, group: int):
@@ -93,12 +94,13 @@ def test_any_number_of_workers_ends_with_the_same_bits(config, store: DemoStore,
         whole = runner.meta_train(plan)
         assert_same_bits(follow(whole), wanted)
         whole.close()
-        for workers, fan_in in ((1, 8), (2, 2), (3, 4)):
+        for workers, fan_in in ((1, 8), (2, 2), (3, 4), (3, 2)):
             meta_training = RayMetaTraining(plan, workers, fan_in)
             assert_same_bits(follow(meta_training), wanted)
             meta_training.close()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("joined")
 def test_neither_the_fan_in_nor_the_blocks_change_a_bit(config, store: DemoStore, data):
     experiment = Experiment(training(config, 11, 1), store)
@@ -133,11 +135,13 @@ def test_the_groups_are_part_of_the_result(config, store: DemoStore, data):
 
 
 @pytest.mark.usefixtures("joined")
-@pytest.mark.parametrize("where", ["between two iterations", "gradient", "add"])
+@pytest.mark.parametrize(
+    ("where", "slots"), [("between two iterations", 5), ("gradient", 5), ("add", 5), ("gradient", 2), ("add", 2)]
+)
 def test_a_killed_worker_changes_nothing(
-    config, store: DemoStore, data, where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config, store: DemoStore, data, where: str, slots: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    experiment = Experiment(training(config, 5, 1), store)
+    experiment = Experiment(training(config, slots, 1), store)
     wanted = alone(experiment, data)
     note = tmp_path / "killed"
 
@@ -146,11 +150,11 @@ def test_a_killed_worker_changes_nothing(
 
         _iteration = 0
 
-        def gradient(self, parameters, iteration, tasks, block):
+        def gradient(self, parameters, iteration, tasks, block, before=()):
             if where == "gradient" and iteration == 2:
                 self._die_once()
             self._iteration = iteration
-            return super().gradient(parameters, iteration, tasks, block)
+            return super().gradient(parameters, iteration, tasks, block, before)
 
         def add(self, *gradients):
             if where == "add" and self._iteration >= 2:
