@@ -123,6 +123,8 @@ class EvaluationConfig(Settings):
     """Steps of adaptation to the support set (E.4)."""
     learning_rate: Positive = 1e-2
     """Of this adaptation (E.4)."""
+    every: Count | None = None
+    """Evaluate every so many iterations of meta-training too: checkpoints, and so a multiple of checkpoint_every."""
 
 
 class ExperimentConfig(Settings):
@@ -143,6 +145,16 @@ class ExperimentConfig(Settings):
             raise ValueError(
                 f"demonstrations.held_out: got {self.demonstrations.held_out}; wanted at least {wanted}, for "
                 f"{self.evaluation.support_draws} disjoint support sets of {max(self.evaluation.shots)}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _evaluate_checkpoints(self) -> "ExperimentConfig":
+        every, checkpoint_every = self.evaluation.every, self.training.checkpoint_every
+        if every is not None and every % checkpoint_every:
+            raise ValueError(
+                f"evaluation.every: got {every}; wanted a multiple of training.checkpoint_every, {checkpoint_every}: "
+                "checkpoints are what is evaluated"
             )
         return self
 

@@ -1,5 +1,6 @@
 """The outer loop of Algorithm 1: which task sits in which slot, a group's gradient, and the step of Adam."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -15,7 +16,19 @@ from dmil_core.methods.base import MetaLearner
 from dmil_core.networks import Parameters
 from dmil_core.seeding import stream
 
-__all__ = ["GroupGradient", "OuterState", "OuterStep", "group_gradient", "groups", "tasks_of"]
+__all__ = [
+    "GroupGradient",
+    "OuterState",
+    "OuterStep",
+    "add",
+    "blocks",
+    "group_gradient",
+    "groups",
+    "tasks_of",
+]
+
+BLOCKS_PER_WORKER = 4
+"""Blocks that each worker should find at least, so that a slow one takes fewer and the others do not wait."""
 
 
 class GroupGradient(NamedTuple):
@@ -50,6 +63,26 @@ def groups(training: TrainingConfig) -> list[range]:
     """Return the slots that are computed and added together, group by group."""
     slots, size = training.tasks_per_iteration, training.slots_per_group
     return [range(first, min(first + size, slots)) for first in range(0, slots, size)]
+
+
+def blocks(groups: Sequence[range], workers: int) -> list[list[range]]:
+    """Return the groups that one worker computes in one call, block by block.
+
+    A block is 2^m consecutive groups that begin at a multiple of 2^m, and so a whole branch of `tree_sum`: its sum is
+    the same bits wherever it is made. One worker takes all groups at once.
+    """
+    size = 1
+    while size < len(groups) if workers == 1 else -(-len(groups) // (2 * size)) >= BLOCKS_PER_WORKER * workers:
+        size *= 2
+    return [list(groups[first : first + size]) for first in range(0, len(groups), size)]
+
+
+def add(gradients: Sequence[Float32[np.ndarray, " size"]]) -> Float32[np.ndarray, " size"]:
+    """Add gradients in the fixed tree, reading them where they lie: in memory that others may read too."""
+    with warnings.catch_warnings():
+        # Torch warns of memory that must not be written to; adding does not.
+        warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
+        return tree_sum([torch.from_numpy(gradient) for gradient in gradients]).numpy()
 
 
 def group_gradient(
@@ -94,7 +127,7 @@ class OuterStep:
         """
         self._parameters = torch.nn.Parameter(torch.tensor(state.parameters))
         self._clip = gradient_clip
-        self._adam = torch.optim.Adam([self._parameters], lr=learning_rate)
+        self._adam = torch.optim.Adam([self._parameters], lr=learning_rate, fused=True)
         self._adam.state[self._parameters] = {
             "step": torch.tensor(float(state.iteration)),
             "exp_avg": torch.tensor(state.first_moment),
@@ -106,9 +139,9 @@ class OuterStep:
         """The current parameters, flat; the next step changes them in place."""
         return self._parameters.detach()
 
-    def __call__(self, gradients: Sequence[Float32[np.ndarray, " size"]]) -> float:
-        """Add the groups' gradients in their fixed tree, take one step, and return the norm before clipping."""
-        self._parameters.grad = tree_sum([torch.tensor(gradient) for gradient in gradients])
+    def __call__(self, gradient: Float32[np.ndarray, " size"]) -> float:
+        """Take one step by the sum of all slots' gradients, and return its norm before clipping."""
+        self._parameters.grad = torch.tensor(gradient)
         norm = torch.nn.utils.clip_grad_norm_([self._parameters], float("inf") if self._clip is None else self._clip)
         self._adam.step()
         return norm.item()

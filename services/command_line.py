@@ -17,7 +17,6 @@ from dmil_core.errors import UserError
 
 __all__ = [
     "ConfigError",
-    "Terminated",
     "config_from",
     "exit_code",
     "explain",
@@ -38,10 +37,6 @@ PROGRAMS = {
 
 class ConfigError(UserError):
     """A setting that is unknown or has an impossible value."""
-
-
-class Terminated(KeyboardInterrupt):
-    """SIGTERM: as Ctrl-C, with another exit code."""
 
 
 def config_from(preset: str, file: Path | None) -> ExperimentConfig:
@@ -132,9 +127,11 @@ def parse(program: type[T], description: str, arguments: Sequence[str], defaults
 
 def exit_code(program: Callable[[Sequence[str]], None], arguments: Sequence[str]) -> int:
     """Run a program and return its exit code: 2 for the user's mistake, 130 and 143 for Ctrl-C and SIGTERM."""
+    received: list[int] = []
 
     def terminate(number: int, frame: object) -> NoReturn:
-        raise Terminated
+        received.append(number)
+        raise KeyboardInterrupt  # as Ctrl-C; of a class of our own nothing would be left where Ray waits
 
     signal.signal(signal.SIGTERM, terminate)
     try:
@@ -142,10 +139,8 @@ def exit_code(program: Callable[[Sequence[str]], None], arguments: Sequence[str]
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except Terminated:
-        return 143
     except KeyboardInterrupt:
-        return 130
+        return 143 if received else 130
     return 0
 
 

@@ -1,6 +1,5 @@
 """One experiment, put together from its config once, for all programs: collect, meta-train, evaluate."""
 
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,16 +13,18 @@ from dmil_core.demonstrations import Demonstration, DemonstrationError, Standard
 from dmil_core.errors import UserError
 from dmil_core.methods.dmil import Dmil
 from dmil_core.networks import Parameters, flatten, unflatten
-from dmil_core.outer_loop import OuterState, tasks_of
+from dmil_core.outer_loop import OuterState
 from dmil_core.seeding import stream
 from dmil_core.statistics import share_entropy
 from services.checkpoints import Checkpoint, CheckpointError, Checkpoints, Manifest
 from services.demo_store import DemoStore, TaskDemonstrations
+from services.evaluation import Evaluations, Evaluator, write_evaluation
 from services.progress import Bar
 from services.provenance import library_versions
-from services.results import AdaptationResult, EpisodeResult, Split, write_rows
-from services.rollouts import Trial, TrialOutcome, trials
-from services.runners import LocalRunner, MetaTraining, RayRunner, Runner
+from services.ray_runner import RayRunner
+from services.results import Split
+from services.rollouts import TrialOutcome
+from services.runners import Iteration, LocalRunner, Plan, Runner
 from services.suites.base import Attempt, TaskSuite
 from services.suites.metaworld import MetaWorldSuite
 from services.summary import Evaluation
@@ -168,37 +169,36 @@ class Experiment:
         checkpoints: Checkpoints,
         tracker: Tracker,
         resume: Checkpoint | None = None,
+        *,
+        overlap_evaluation: bool = True,
     ) -> Checkpoint:
         """Meta-train to the set number of iterations and return the last checkpoint.
 
-        Stopped by Ctrl-C or SIGTERM, it writes a checkpoint first.
+        Stopped by Ctrl-C or SIGTERM, it writes a checkpoint first, and drops an evaluation that is under way.
 
         Args:
             runner: does the work.
             data: every task's demonstrations.
-            checkpoints: where to keep them.
+            checkpoints: where to keep them; evaluations on the way are kept in ``evaluations`` beside.
             tracker: takes the metrics of each iteration.
             resume: go on from here.
+            overlap_evaluation: go on with meta-training during evaluations on the way.
 
         Raises:
             CheckpointError: if the checkpoint to go on from was trained on other demonstrations.
         """
-        training = self.config.training
+        settings = self.config.training
         sets = self.training_sets(data)
         method = self.method(sets)
         initial = self.initial_parameters(method)
         shapes = {name: tensor.shape for name, tensor in initial.items()}
         digests = {task: dataset.digest for task, dataset in data.items()}
-        if resume is not None and resume.manifest.data != digests:
-            changed = [task for task in digests if resume.manifest.data.get(task) != digests[task]]
-            raise CheckpointError(
-                f"{resume.path}: trained on other demonstrations of {', '.join(changed)} than the store "
-                f"{self.store.root} holds; point DMIL_DATA to those it was trained on"
-            )
+        _same_data(resume, digests, self.store)
         state = OuterState.start(flatten(initial).numpy()) if resume is None else resume.state
+        if state.iteration >= settings.iterations and resume is not None:
+            return resume
 
-        def save(loss: float | None) -> Path:
-            state = runner.state()
+        def save(state: OuterState, loss: float | None) -> Path:
             parameters = unflatten(torch.tensor(state.parameters), shapes)
             manifest = Manifest(
                 iteration=state.iteration,
@@ -212,30 +212,41 @@ class Experiment:
             arrays = {name: tensor.numpy() for name, tensor in parameters.items()}
             return checkpoints.save(state, arrays, method.constants(), manifest)
 
-        if state.iteration >= training.iterations and resume is not None:
-            return resume
-        runner.start_training(MetaTraining(method, shapes, sets, state, training, self.config.seed))
+        evaluations = Evaluations(
+            runner,
+            self.evaluator(runner, data),
+            checkpoints.folder.with_name("evaluations"),
+            tracker,
+            overlap=overlap_evaluation,
+        )
+        training = runner.meta_train(Plan(method, shapes, sets, state, settings, self.config.seed))
         losses: list[float] = []
-        path = None
+        path, saved = None, -1
         try:
-            with Bar("meta-training", training.iterations, state.iteration) as bar:
-                for iteration in range(state.iteration, training.iterations):
-                    began = time.perf_counter()
-                    tasks = tasks_of(iteration, self.suite.train_tasks, self.config.seed, training.tasks_per_iteration)
-                    slots, norm = runner.iterate(iteration, tasks)
-                    metrics = _iteration_metrics(slots, norm, time.perf_counter() - began)
-                    tracker.metrics(iteration + 1, metrics)
+            with Bar("meta-training", settings.iterations, state.iteration) as bar:
+                for iteration in training.iterations(settings.iterations - state.iteration):
+                    done = iteration.number
+                    metrics = _iteration_metrics(iteration)
+                    tracker.metrics(done, metrics)
                     losses.append(metrics["high_loss_after"] + metrics["low_loss_after"])
                     bar.advance(1, _in_words(metrics))
-                    if (iteration + 1) % training.checkpoint_every == 0 or iteration + 1 == training.iterations:
-                        path = save(float(np.mean(losses)))
+                    evaluations.look()
+                    last = done == settings.iterations
+                    if done % settings.checkpoint_every == 0 or last:
+                        path, saved = save(training.state(), float(np.mean(losses))), done
                         losses.clear()
-            return Checkpoint(path or save(None))
+                        # The last checkpoint is evaluated by all workers when meta-training is over.
+                        if self.config.evaluation.every and done % self.config.evaluation.every == 0 and not last:
+                            evaluations.begin(Checkpoint(path))
+                evaluations.finish()
+            return Checkpoint(path or save(training.state(), None))
         except KeyboardInterrupt:
-            save(float(np.mean(losses)) if losses else None)
+            state = training.state()
+            if state.iteration != saved:
+                save(state, float(np.mean(losses)) if losses else None)
             raise
         finally:
-            runner.end_training()
+            training.close()
 
     # Evaluation
 
@@ -246,51 +257,47 @@ class Experiment:
 
         The rows are also written to ``episodes.jsonl`` and ``adaptations.jsonl`` in `folder`.
         """
-        evaluation = self.config.evaluation
-        held_out = self.held_out_sets(data)
-        method = Dmil.restored(self.config.method, self.suite.action_dim, checkpoint.constants)
-        shapes = {name: torch.Size(shape) for name, shape in checkpoint.manifest.shapes.items()}
-        plan = trials(self.tasks, evaluation)
-        shared_parameters = runner.share(checkpoint.state.parameters)
-        shared_sets = {task: runner.share(demonstrations) for task, demonstrations in held_out.items()}
-        calls = [
-            (method, shared_parameters, shapes, trial, shared_sets[trial.task], evaluation, self.config.seed)
-            for trial in plan
-        ]
+        evaluator = self.evaluator(runner, data)
         outcomes: dict[int, TrialOutcome] = {}
         successes = 0
-        with Bar("evaluating", sum(len(trial.episodes) for trial in plan)) as bar:
-            for index, outcome in runner.simulate("try_out", calls):
+        with Bar("evaluating", sum(len(trial.episodes) for trial in evaluator.trials)) as bar:
+            for index, outcome in runner.simulate("try_out", evaluator.calls(checkpoint)):
                 outcomes[index] = outcome
                 successes += sum(episode.success for episode in outcome.episodes)
-                bar.advance(len(plan[index].episodes), f"{successes} solved; {plan[index].task}")
-        common = {"suite": self.suite.name, "protocol": self.suite.protocol, "method": self.config.method.name}
-        common |= {"checkpoint": checkpoint.digest, "versions": library_versions()}
-        common |= {"fine_tuning_steps": evaluation.fine_tuning_steps, "learning_rate": evaluation.learning_rate}
-        episodes, adaptations = [], []
-        for index, trial in enumerate(plan):
-            row = common | {
-                "split": trial.split,
-                "task": trial.task,
-                "shots": trial.shots,
-                "draw": trial.draw,
-                "support": [demonstration.id for demonstration in trial.support(held_out[trial.task])],
-                "data": data[trial.task].digest,
-            }
-            episodes += _episode_rows(row, trial, outcomes[index])
-            adaptations.append(_adaptation_row(row, outcomes[index], method.sub_skills))
-        for name, rows in (("episodes.jsonl", episodes), ("adaptations.jsonl", adaptations)):
-            (folder / name).unlink(missing_ok=True)
-            write_rows(folder / name, rows)
-        failed = {task: dataset.failed for task, dataset in data.items()}
-        return Evaluation(checkpoint, self.suite.protocol, failed, episodes, adaptations)
+                trial = evaluator.trials[index]
+                bar.advance(len(trial.episodes), f"{successes} solved; {trial.task}")
+        evaluation = evaluator.evaluation(checkpoint, [outcomes[index] for index in range(len(evaluator.trials))])
+        write_evaluation(evaluation, folder)
+        return evaluation
+
+    def evaluator(self, runner: Runner, data: Mapping[str, TaskDemonstrations]) -> Evaluator:
+        """Return what evaluates the checkpoints of this experiment."""
+        return Evaluator(runner, self.config, self.suite, self.tasks, data, self.held_out_sets(data))
 
 
-def _iteration_metrics(slots: Sequence[Mapping[str, float]], norm: float, seconds: float) -> dict[str, float]:
-    """Return an iteration's metrics: the means over its slots, and what they say together."""
-    metrics = {name: float(np.mean([slot[name] for slot in slots])) for name in slots[0]}
-    entropy = share_entropy(_shares(metrics))
-    return metrics | {"sub_skill_entropy": entropy, "gradient_norm": norm, "iterations_per_second": 1 / seconds}
+def _same_data(resume: Checkpoint | None, digests: Mapping[str, str], store: DemoStore) -> None:
+    """Refuse to go on with other demonstrations.
+
+    Raises:
+        CheckpointError: names the tasks whose demonstrations differ.
+    """
+    if resume is not None and resume.manifest.data != digests:
+        changed = [task for task in digests if resume.manifest.data.get(task) != digests[task]]
+        raise CheckpointError(
+            f"{resume.path}: trained on other demonstrations of {', '.join(changed)} than the store {store.root} "
+            "holds; point DMIL_DATA to those it was trained on"
+        )
+
+
+def _iteration_metrics(iteration: Iteration) -> dict[str, float]:
+    """Return an iteration's metrics: the means over its slots, what they say together, and how fast it went."""
+    metrics = {name: float(np.mean([slot[name] for slot in iteration.slots])) for name in iteration.slots[0]}
+    return metrics | {
+        "sub_skill_entropy": share_entropy(_shares(metrics)),
+        "gradient_norm": iteration.gradient_norm,
+        "iterations_per_second": 1 / iteration.timing.iteration,
+        "overhead_share": iteration.timing.overhead_share,
+    }
 
 
 def _shares(metrics: Mapping[str, float]) -> np.ndarray:
@@ -303,21 +310,4 @@ def _in_words(metrics: Mapping[str, float]) -> str:
         f"losses {metrics['high_loss_after']:.3f} high, {metrics['low_loss_after']:.3f} low; "
         f"sub-skills in use {(shares > 0.01).sum()}/{len(shares)}; "
         f"{metrics['iterations_per_second']:.1f} iterations/s"
-    )
-
-
-def _episode_rows(row: Mapping[str, object], trial: Trial, outcome: TrialOutcome) -> list[EpisodeResult]:
-    return [
-        EpisodeResult.model_validate({**row, "episode": number, **episode._asdict()})
-        for number, episode in zip(trial.episodes, outcome.episodes, strict=True)
-    ]
-
-
-def _adaptation_row(row: Mapping[str, object], outcome: TrialOutcome, sub_skills: int) -> AdaptationResult:
-    none = np.zeros(0, np.int64)  # where the support set is all that is held out
-    chosen = np.concatenate([none, *(use.chosen for use in outcome.use)])
-    best = np.concatenate([none, *(use.best for use in outcome.use)])
-    counts = np.bincount(chosen, minlength=sub_skills)
-    return AdaptationResult.model_validate(
-        {**row, "steps": len(chosen), "agreeing": int((chosen == best).sum()), "sub_skill_steps": counts.tolist()}
     )

@@ -42,6 +42,8 @@ class Arguments:
     """Where to work: in Ray actors, or in this process; the result is the same to the bit."""
     workers: int | None = None
     """Ray workers of each kind, one for each CPU of the cluster if not given; they do not change the result."""
+    overlap_evaluation: bool = True
+    """Go on with meta-training during the evaluations that --evaluation.every asks for; the results are the same."""
     runs: Path = Path("runs")
     """The folder that the run's own folder is made in."""
     name: str | None = None
@@ -69,7 +71,9 @@ def run(arguments: Sequence[str]) -> None:
             data = experiment.collect(runner)
             tracker.inputs({dataset.id: dataset.digest for dataset in data.values()})
             clock.lap("collect")
-            trained = experiment.train(runner, data, checkpoints, tracker, checkpoint)
+            trained = experiment.train(
+                runner, data, checkpoints, tracker, checkpoint, overlap_evaluation=given.overlap_evaluation
+            )
             clock.lap("train")
             evaluation = experiment.evaluate(runner, data, trained, folder)
             clock.lap("evaluate")

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 
 from services.checkpoints import Checkpoint
 from services.progress import console
-from services.summary import Summary, table, table_markdown, write_summary
+from services.summary import Summary, rates, table, table_markdown, write_summary
 from services.tracking import Tracker
 
 __all__ = ["draw_curves", "publish", "read_metrics", "show", "write_report"]
@@ -78,16 +78,9 @@ def write_report(summary: Summary, folder: Path) -> None:
 
 def publish(tracker: Tracker, summary: Summary, folder: Path) -> None:
     """Record the success rates, of each task and in all, the report and the checkpoint on the MLflow run."""
-    rates: dict[str, float] = {}
-    for cell in summary.rows:
-        name = f"{cell.split}/{cell.shots}-shot"
-        rates |= {f"success_rate/{name}": cell.success_rate, f"success_rate_low/{name}": cell.low}
-        rates |= {f"success_rate_high/{name}": cell.high, f"episodes/{name}": float(cell.episodes)}
-        rates |= {f"task_success_rate/{name}/{task}": rate for task, rate in cell.per_task.items()}
-    for split, use in summary.sub_skills.items():
-        rates |= {f"agreement/{split}": use.agreement, f"sub_skill_entropy/{split}": use.entropy}
-    rates |= {f"seconds/{phase}": spent for phase, spent in summary.seconds.items()}
-    tracker.metrics(Checkpoint(Path(summary.checkpoint)).manifest.iteration, rates)
+    metrics = rates(summary.rows, summary.sub_skills)
+    metrics |= {f"seconds/{phase}": spent for phase, spent in summary.seconds.items()}
+    tracker.metrics(Checkpoint(Path(summary.checkpoint)).manifest.iteration, metrics)
     tracker.tags({"mlflow.note.content": table_markdown(summary)})
     for path, destination in (
         (folder / "report", "report"),

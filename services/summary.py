@@ -1,6 +1,6 @@
 """From result rows to the table that a run ends with."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
@@ -21,6 +21,7 @@ __all__ = [
     "SubSkillUse",
     "Summary",
     "cells",
+    "rates",
     "sub_skill_use",
     "summarise",
     "table",
@@ -132,6 +133,19 @@ def sub_skill_use(adaptations: Sequence[AdaptationResult]) -> dict[Split, SubSki
             agreement=sum(row.agreeing for row in rows) / sum(row.steps for row in rows),
         )
     return use
+
+
+def rates(rows: Sequence[Cell], use: Mapping[Split, SubSkillUse]) -> dict[str, float]:
+    """Return the metrics of an evaluation by the names they are tracked under: of each task, and in all."""
+    found: dict[str, float] = {}
+    for cell in rows:
+        name = f"{cell.split}/{cell.shots}-shot"
+        found |= {f"success_rate/{name}": cell.success_rate, f"success_rate_low/{name}": cell.low}
+        found |= {f"success_rate_high/{name}": cell.high, f"episodes/{name}": float(cell.episodes)}
+        found |= {f"task_success_rate/{name}/{task}": rate for task, rate in cell.per_task.items()}
+    for split, figures in use.items():
+        found |= {f"agreement/{split}": figures.agreement, f"sub_skill_entropy/{split}": figures.entropy}
+    return found
 
 
 def summarise(

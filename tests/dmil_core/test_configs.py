@@ -70,6 +70,7 @@ def test_presets_leave_enough_demonstrations_for_four_disjoint_sets(preset: Expe
         (EvaluationConfig, "shots", (1, 0)),
         (EvaluationConfig, "episodes", 0),
         (EvaluationConfig, "fine_tuning_steps", -1),
+        (EvaluationConfig, "every", 0),
         (ExperimentConfig, "method", {"sub_skils": 3}),
     ],
 )
@@ -96,6 +97,16 @@ def test_some_demonstrations_are_left_for_training(per_task: int, held_out: int,
     else:
         with pytest.raises(ValidationError, match=f"held_out: got {held_out} of per_task {per_task}"):
             DemonstrationConfig(per_task=per_task, held_out=held_out)
+
+
+@pytest.mark.parametrize(("every", "allowed"), [(None, True), (4, True), (12, True), (6, False), (2, False)])
+def test_only_checkpoints_are_evaluated(every: int | None, allowed: bool) -> None:
+    settings = {"training": TrainingConfig(checkpoint_every=4), "evaluation": EvaluationConfig(every=every)}
+    if allowed:
+        assert ExperimentConfig(**settings).evaluation.every == every
+    else:
+        with pytest.raises(ValidationError, match=f"evaluation.every: got {every}; wanted a multiple of .*every, 4"):
+            ExperimentConfig(**settings)
 
 
 @pytest.mark.parametrize(("held_out", "allowed"), [(20, True), (19, False)])

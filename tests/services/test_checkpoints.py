@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dmil_core.configs import ExperimentConfig
-from dmil_core.outer_loop import OuterState, OuterStep
+from dmil_core.outer_loop import OuterState, OuterStep, add
 from services.checkpoints import Checkpoint, CheckpointError, Checkpoints, Manifest
 
 SHAPES = {"high.0.weight": (3, 2), "high.0.bias": (3,), "a.comes.first.in.the.file": (4,)}
@@ -20,7 +20,7 @@ def gradients(iteration: int) -> list[np.ndarray]:
 def advance(state: OuterState, iterations: int) -> OuterState:
     step = OuterStep(state, learning_rate=1e-2, gradient_clip=1.0)
     for iteration in range(state.iteration, state.iteration + iterations):
-        step(gradients(iteration))
+        step(add(gradients(iteration)))
     return step.state
 
 

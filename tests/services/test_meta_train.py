@@ -201,7 +201,9 @@ def test_a_stopped_run_goes_on_with_the_same_bits(
 ):
     session = f"{runner}-{wanted}-{os.getpid()}"
     monkeypatch.setenv("DMIL_TEST_SESSION", session)
-    arguments = ("--preset", "ml10-smoke", "--runner", runner, "--name", "run", "--training.checkpoint-every", "5")
+    arguments = ["--preset", "ml10-smoke", "--runner", runner, "--name", "run", "--training.checkpoint-every", "5"]
+    if runner == "ray":
+        arguments += ["--evaluation.every", "5"]  # one is under way then, and dropped
     program = programs.start("meta_train", *arguments, "--training.iterations", "100000")
     checkpoints = Checkpoints(workplace / "runs" / "run" / "checkpoints", 3)
     wait_for(lambda: bool(checkpoints.all()) or program.poll() is not None, "the first checkpoint")

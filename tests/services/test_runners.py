@@ -2,19 +2,26 @@
 
 import os
 import signal
+from collections.abc import Callable, Mapping
+from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-import psutil
 import pytest
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.networks import flatten
-from dmil_core.outer_loop import OuterState, tasks_of
+from dmil_core.outer_loop import OuterState, groups
+from services.actors.adaptation import AdaptationWorker
+from services.actors.freight import PIECE, pack, unpack
+from services.actors.learner import Learner
 from services.demo_store import DemoStore
 from services.experiment import Experiment, open_runner
+from services.ray_runner import RayMetaTraining
 from services.results import EpisodeResult
-from services.runners import MetaTraining, RayRunner, Runner
+from services.runners import MetaTraining, Plan, Runner
+from services.timing import Span, Timing
 
 ITERATIONS = 4
 
@@ -24,90 +31,190 @@ def training(config: ExperimentConfig, slots: int, group: int) -> ExperimentConf
     return config.model_copy(update={"training": config.training.model_copy(update=settings)})
 
 
-def iterate(runner: Runner, experiment: Experiment, data, disturb=lambda iteration: None):
-    """Return the learner's state, and the metrics and norms on the way, after a few iterations."""
+def plan_of(experiment: Experiment, data) -> Plan:
     config = experiment.config
     sets = experiment.training_sets(data)
     method = experiment.method(sets)
     initial = experiment.initial_parameters(method)
     shapes = {name: tensor.shape for name, tensor in initial.items()}
-    state = OuterState.start(flatten(initial).numpy())
-    runner.start_training(MetaTraining(method, shapes, sets, state, config.training, config.seed))
-    seen = []
-    for iteration in range(ITERATIONS):
-        disturb(iteration)
-        tasks = tasks_of(iteration, experiment.suite.train_tasks, config.seed, config.training.tasks_per_iteration)
-        seen.append(runner.iterate(iteration, tasks))
-    state = runner.state()
-    runner.end_training()
-    return state, seen
+    return Plan(method, shapes, sets, OuterState.start(flatten(initial).numpy()), config.training, config.seed)
 
 
-def assert_same_bits(one, other) -> None:
-    assert one[0].iteration == other[0].iteration == ITERATIONS
-    assert all(map(np.array_equal, one[0][1:], other[0][1:]))
-    assert one[1] == other[1]
+class Course(NamedTuple):
+    """What was to be seen of a meta-training from outside, iteration by iteration."""
+
+    numbers: list[int]
+    slots: list[list[Mapping[str, float]]]
+    norms: list[float]
+    states: list[OuterState]
+
+
+def follow(
+    training: MetaTraining, count: int = ITERATIONS, disturb: Callable[[int], None] = lambda done: None
+) -> Course:
+    """Do a few iterations, looking at the state after each."""
+    course = Course([], [], [], [])
+    for iteration in training.iterations(count):
+        course.numbers.append(iteration.number)
+        course.slots.append(iteration.slots)
+        course.norms.append(iteration.gradient_norm)
+        course.states.append(training.state())
+        disturb(iteration.number)
+    return course
+
+
+def alone(experiment: Experiment, data) -> Course:
+    """Do the same in this process."""
+    with open_runner("local", experiment.suite, None) as runner:
+        return follow(runner.meta_train(plan_of(experiment, data)))
+
+
+def assert_same_bits(one: Course, other: Course) -> None:
+    assert one[:3] == other[:3]
+    for state, wanted in zip(one.states, other.states, strict=True):
+        assert state.iteration == wanted.iteration
+        assert all(map(np.array_equal, state[1:], wanted[1:]))
+
+
+def cut(groups: int, size: int) -> list[slice]:
+    return [slice(first, first + size) for first in range(0, groups, size)]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("joined")
+@pytest.mark.parametrize(("slots", "group"), [(5, 1), (7, 3)])
+def test_any_number_of_workers_ends_with_the_same_bits(config, store: DemoStore, data, slots: int, group: int):
+    experiment = Experiment(training(config, slots, group), store)
+    wanted = alone(experiment, data)
+    assert np.isfinite(wanted.states[-1].parameters).all()
+    assert wanted.numbers == [state.iteration for state in wanted.states] == list(range(1, ITERATIONS + 1))
+    assert len(wanted.slots[0]) == slots
+    plan = plan_of(experiment, data)
+    with open_runner("ray", experiment.suite, 3) as runner:
+        whole = runner.meta_train(plan)
+        assert_same_bits(follow(whole), wanted)
+        whole.close()
+        for workers, fan_in in ((1, 8), (2, 2), (3, 4), (3, 2)):
+            meta_training = RayMetaTraining(plan, workers, fan_in)
+            assert_same_bits(follow(meta_training), wanted)
+            meta_training.close()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("joined")
+def test_neither_the_fan_in_nor_the_blocks_change_a_bit(config, store: DemoStore, data):
+    experiment = Experiment(training(config, 11, 1), store)
+    wanted = alone(experiment, data)
+    all_groups = groups(experiment.config.training)
+    with open_runner("ray", experiment.suite, 2):
+        for fan_in, size in ((2, 1), (4, 1), (2, 2), (8, 4)):
+            meta_training = RayMetaTraining(plan_of(experiment, data), 2, fan_in)
+            meta_training.blocks = [all_groups[part] for part in cut(len(all_groups), size)]
+            assert_same_bits(follow(meta_training), wanted)
+            meta_training.close()
 
 
 @pytest.mark.usefixtures("joined")
-@pytest.mark.parametrize(("slots", "group", "workers"), [(5, 1, (1, 2, 3)), (7, 3, (2,))])
-def test_any_number_of_workers_ends_with_the_same_bits(config, store: DemoStore, data, slots, group, workers):
-    experiment = Experiment(training(config, slots, group), store)
-    with open_runner("local", experiment.suite, None) as runner:
-        alone = iterate(runner, experiment, data)
-    assert np.isfinite(alone[0].parameters).all()
-    assert len(alone[1][0][0]) == slots
-    for count in workers:
-        with open_runner("ray", experiment.suite, count) as runner:
-            assert_same_bits(iterate(runner, experiment, data), alone)
+def test_going_on_after_a_pause_changes_nothing(config, store: DemoStore, data):
+    experiment = Experiment(training(config, 5, 1), store)
+    wanted = alone(experiment, data)
+    with open_runner("ray", experiment.suite, 2) as runner:
+        meta_training = runner.meta_train(plan_of(experiment, data))
+        parts = [follow(meta_training, count) for count in (1, 0, ITERATIONS - 1)]
+    assert_same_bits(Course(*(list(chain(*lists)) for lists in zip(*parts, strict=True))), wanted)
 
 
 def test_the_groups_are_part_of_the_result(config, store: DemoStore, data):
-    """Else the test above would show nothing: the order of addition matters to the last bits."""
+    """Else the tests above would show nothing: the order of addition matters to the last bits."""
     found = []
     for group in (1, 3):
         experiment = Experiment(training(config, 7, group), store)
-        with open_runner("local", experiment.suite, None) as runner:
-            found.append(iterate(runner, experiment, data)[0].parameters)
+        found.append(alone(experiment, data).states[-1].parameters)
     assert not np.array_equal(*found)
     assert np.allclose(*found, atol=1e-3)
 
 
-def adaptation_workers() -> list[psutil.Process]:
-    return [process for process in psutil.process_iter() if "ray::AdaptationWorker" in " ".join(cmdline(process))]
+@pytest.mark.usefixtures("joined")
+@pytest.mark.parametrize(
+    ("where", "slots"), [("between two iterations", 5), ("gradient", 5), ("add", 5), ("gradient", 2), ("add", 2)]
+)
+def test_a_killed_worker_changes_nothing(
+    config, store: DemoStore, data, where: str, slots: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    experiment = Experiment(training(config, slots, 1), store)
+    wanted = alone(experiment, data)
+    note = tmp_path / "killed"
 
+    class Mortal(AdaptationWorker):
+        """One of them is killed in the middle of its work, in the third iteration."""
 
-def cmdline(process: psutil.Process) -> list[str]:
-    try:
-        return process.cmdline()
-    except psutil.Error:
-        return []
+        _iteration = 0
+
+        def gradient(self, parameters, iteration, tasks, block, before=()):
+            if where == "gradient" and iteration == 2:
+                self._die_once()
+            self._iteration = iteration
+            return super().gradient(parameters, iteration, tasks, block, before)
+
+        def add(self, *gradients):
+            if where == "add" and self._iteration >= 2:
+                self._die_once()
+            return super().add(*gradients)
+
+        def _die_once(self):
+            try:
+                note.touch(exist_ok=False)
+            except FileExistsError:
+                return
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def kill(done: int) -> None:
+        if where == "between two iterations" and done == 2:
+            assert isinstance(meta_training, RayMetaTraining)
+            meta_training._pool._actors[0].__ray_call__.remote(lambda worker: worker._die_once())
+
+    monkeypatch.setattr("services.ray_runner.AdaptationWorker", Mortal)
+    with open_runner("ray", experiment.suite, 2) as runner:
+        meta_training = runner.meta_train(plan_of(experiment, data))
+        disturbed = follow(meta_training, disturb=kill)
+    assert note.exists()
+    assert isinstance(meta_training, RayMetaTraining)
+    assert meta_training.restarts == 1
+    assert_same_bits(disturbed, wanted)
 
 
 @pytest.mark.usefixtures("joined")
-def test_a_killed_worker_changes_nothing(config, store: DemoStore, data, monkeypatch: pytest.MonkeyPatch):
-    experiment = Experiment(training(config, 5, 1), store)
-    with open_runner("local", experiment.suite, None) as runner:
-        alone = iterate(runner, experiment, data)
-    killed = []
+@pytest.mark.parametrize("workers", [1, 3])
+def test_the_learner_receives_one_gradient(
+    config, store: DemoStore, data, workers: int, monkeypatch: pytest.MonkeyPatch
+):
+    class Strict(Learner):
+        def step(self, gradient):
+            assert [len(piece) for piece in gradient] == [len(piece) for piece in self.parameters()[1]]
+            return super().step(gradient)
 
-    with open_runner("ray", experiment.suite, 2) as runner:
-        assert isinstance(runner, RayRunner)
+    monkeypatch.setattr("services.ray_runner.Learner", Strict)
+    experiment = Experiment(training(config, 9, 1), store)
+    with open_runner("ray", experiment.suite, workers):
+        meta_training = RayMetaTraining(plan_of(experiment, data), workers, fan_in=2)
+        assert follow(meta_training).numbers == list(range(1, ITERATIONS + 1))
 
-        def kill(iteration: int) -> None:
-            if iteration == 2:
-                assert runner._adaptation is not None
-                (pid,) = runner._ray.get([runner._adaptation._actors[0].__ray_call__.remote(lambda _: os.getpid())])
-                os.kill(pid, signal.SIGKILL)
-                killed.append(pid)
 
-        pools = []
-        start = runner.start_training
-        monkeypatch.setattr(runner, "start_training", lambda *given: (start(*given), pools.append(runner._adaptation)))
-        disturbed = iterate(runner, experiment, data, kill)
-    assert (len(killed), [pool.restarts for pool in pools]) == (1, [1])
-    assert not psutil.pid_exists(killed[0])
-    assert_same_bits(disturbed, alone)
+@pytest.mark.parametrize("size", [1, PIECE, PIECE + 1, 3 * PIECE])
+def test_what_is_packed_arrives_as_it_was(size: int):
+    vector = np.random.default_rng(0).normal(size=size).astype(np.float32)
+    packed = pack(vector)
+    assert all(len(piece) <= PIECE for piece in packed)
+    assert np.array_equal(unpack(packed), vector)
+    assert not any(np.shares_memory(piece, unpack(packed)) for piece in packed)
+
+
+def test_the_time_of_an_iteration_is_divided_up_whole():
+    work = {0: [Span(11, 13), Span(13.5, 15)], 4: [Span(12, 14)]}
+    timing = Timing.of(10, work, Span(17, 18))
+    assert timing == Timing(broadcast=1.5, compute=2.75, waiting=0.75, reduction=2, step=1)
+    assert timing.iteration == 8
+    assert timing.overhead_share == 1 - 3.75 / 8
 
 
 def episodes_of(runner: Runner, experiment: Experiment, data, checkpoint, folder: Path) -> list[EpisodeResult]:
