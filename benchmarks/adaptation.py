@@ -78,7 +78,7 @@ def _contests(given: Arguments) -> list[Contest]:
     def theirs() -> dict[str, Tensor]:
         return {name: tensor.detach() for name, tensor in twin.adapt(parameters, support, steps, rate).items()}
 
-    policy, adapted = DmilPolicy(ours(), Standardisation.identity(OBS_DIM)), theirs()
+    policy, adapted = DmilPolicy(ours().for_acting(), Standardisation.identity(OBS_DIM)), theirs()
     difference = max((policy.hierarchy.parameters[name] - adapted[name]).abs().max().item() for name in adapted)
     assert difference < 1e-3, f"ours and the twin differ by {difference}"
     weights = torch.randn(sum(layer.weight.numel() for layer in (*hierarchy.high, *hierarchy.low[0])))

@@ -281,7 +281,7 @@ def one_policy(
     method = Dmil(config.method, suite.action_dim, Standardisation.of(support))
     initial = method.initial_parameters(stream(config.seed, "initial parameters"))
     policy = method.adapt(initial, support, FineTuning(steps, config.evaluation.learning_rate))
-    return method, policy.parameters, demonstrations
+    return method, policy.hierarchy.parameters, demonstrations
 
 
 def start_worker(suite: MetaWorldSuite) -> None:

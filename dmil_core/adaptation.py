@@ -16,7 +16,7 @@ from dmil_core.losses import (
     squared_errors,
     sub_skill_labels,
 )
-from dmil_core.networks import Network, Parameters, bank, mlp, network, own_states, stacked
+from dmil_core.networks import Layer, Network, Parameters, bank, mlp, network, own_states, stacked
 from dmil_core.slopes import Slope, slope
 
 __all__ = [
@@ -43,6 +43,14 @@ class Hierarchy(NamedTuple):
     def of(cls, parameters: Parameters) -> "Hierarchy":
         """Return views of the high level (``high.*``) and of the bank of sub-skills (``low.*``)."""
         return cls(network(parameters, "high"), bank(parameters, "low"))
+
+    def for_acting(self) -> "Hierarchy":
+        """Return a copy with the weights in the layout in which products with a few states read them fastest."""
+        high, *low = (
+            tuple(Layer(weight.mT.clone(memory_format=torch.contiguous_format).mT, bias) for weight, bias in layers)
+            for layers in (self.high, *self.low)
+        )
+        return Hierarchy(high, tuple(low))
 
     @property
     def parameters(self) -> Parameters:
