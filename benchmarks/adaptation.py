@@ -17,7 +17,7 @@ from torch import Tensor
 
 from benchmarks.masked_twin import MaskedTwin
 from benchmarks.timing import alternate, write_rows
-from benchmarks.workload import OBS_DIM, draw_parameters, draw_steps, settings
+from benchmarks.workload import OBS_DIM, as_in_a_run, draw_parameters, draw_steps, settings
 from dmil_core.adaptation import Hierarchy, adapt
 from dmil_core.demonstrations import Standardisation
 from dmil_core.methods.dmil import DmilPolicy
@@ -70,7 +70,7 @@ def _contests(given: Arguments) -> list[Contest]:
     config = settings("paper", given.sub_skills, "second")
     parameters, support = draw_parameters(config), draw_steps(0, given.shots, 100)
     steps, rate, weight = given.fine_tuning_steps, 1e-3, config.continuity_weight
-    twin, hierarchy = MaskedTwin(config), Hierarchy.of(parameters)
+    twin, hierarchy = MaskedTwin(config), Hierarchy.of(as_in_a_run(parameters))
 
     def ours() -> Hierarchy:
         return adapt(hierarchy, support, support, steps=steps, learning_rate=rate, continuity_weight=weight).hierarchy
@@ -78,7 +78,7 @@ def _contests(given: Arguments) -> list[Contest]:
     def theirs() -> dict[str, Tensor]:
         return {name: tensor.detach() for name, tensor in twin.adapt(parameters, support, steps, rate).items()}
 
-    policy, adapted = DmilPolicy(ours().for_acting(), Standardisation.identity(OBS_DIM)), theirs()
+    policy, adapted = DmilPolicy(ours(), Standardisation.identity(OBS_DIM)), theirs()
     difference = max((policy.hierarchy.parameters[name] - adapted[name]).abs().max().item() for name in adapted)
     assert difference < 1e-3, f"ours and the twin differ by {difference}"
     weights = torch.randn(sum(layer.weight.numel() for layer in (*hierarchy.high, *hierarchy.low[0])))

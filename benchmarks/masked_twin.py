@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from dmil_core.configs import DmilConfig
 from dmil_core.losses import Steps
-from dmil_core.networks import Parameters
+from dmil_core.networks import Parameters, flatten
 
 __all__ = ["MaskedTwin", "Sets"]
 
@@ -92,7 +92,7 @@ class MaskedTwin:
             leaves = tensors = {name: tensor.detach().requires_grad_() for name, tensor in tensors.items()}
         high, low = self.high_loss(tensors, sets[2]), self.low_loss(tensors, sets[3])
         gradients = torch.autograd.grad(high + low, list(leaves.values()))
-        return torch.cat([gradient.flatten() for gradient in gradients]), high.item(), low.item()
+        return flatten(dict(zip(leaves, gradients, strict=True))), high.item(), low.item()
 
     def adapt(self, parameters: Parameters, support: Steps, steps: int, rate: float) -> Parameters:
         """Return the parameters adapted to a support set, as at test."""

@@ -24,7 +24,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from benchmarks.masked_twin import MaskedTwin
 from benchmarks.timing import alternate, write_rows
-from benchmarks.workload import OBS_DIM, Size, draw_parameters, draw_sets, settings
+from benchmarks.workload import OBS_DIM, Size, as_in_a_run, draw_parameters, draw_sets, settings
 from dmil_core.configs import DmilConfig
 from dmil_core.meta_gradient import task_gradient
 from services.command_line import exit_code, parse
@@ -91,7 +91,7 @@ class Worker:
     """One of our workers: a share of the tasks on one thread."""
 
     def __init__(self, config: DmilConfig, size: Size, tasks: Sequence[int]) -> None:
-        self.config, self.parameters = config, draw_parameters(config)
+        self.config, self.parameters = config, as_in_a_run(draw_parameters(config))
         self.sets = [draw_sets(size, config, task) for task in tasks]
         self.products: list[tuple[Tensor, Tensor, Tensor, bool]] = []
 

@@ -7,10 +7,10 @@ import torch
 from benchmarks.masked_twin import Sets
 from dmil_core.configs import PRESETS, DmilConfig
 from dmil_core.losses import Steps
-from dmil_core.networks import Parameters, initialise
+from dmil_core.networks import Parameters, flatten, initialise, unflatten
 from dmil_core.seeding import stream
 
-__all__ = ["ACTION_DIM", "OBS_DIM", "Size", "draw_parameters", "draw_sets", "draw_steps", "settings"]
+__all__ = ["ACTION_DIM", "OBS_DIM", "Size", "as_in_a_run", "draw_parameters", "draw_sets", "draw_steps", "settings"]
 
 OBS_DIM, ACTION_DIM = 39, 4
 Size: TypeAlias = Literal["paper", "quick"]
@@ -46,3 +46,8 @@ def draw_parameters(config: DmilConfig) -> Parameters:
         **initialise("high", [OBS_DIM, *hidden, k], draw),
         **initialise("low", [OBS_DIM, *hidden, ACTION_DIM], draw, copies=k),
     }
+
+
+def as_in_a_run(parameters: Parameters) -> Parameters:
+    """Return a copy laid out in one vector, as a worker gets them."""
+    return unflatten(flatten(parameters), {name: tensor.shape for name, tensor in parameters.items()})

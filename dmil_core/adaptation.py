@@ -11,12 +11,11 @@ from torch import Tensor
 from dmil_core.losses import (
     Steps,
     behaviour_cloning_loss,
-    differentiated,
     high_level_loss,
     squared_errors,
     sub_skill_labels,
 )
-from dmil_core.networks import Layer, Network, Parameters, bank, mlp, network, own_states, stacked
+from dmil_core.networks import Network, Parameters, bank, mlp, network, own_states, stacked
 from dmil_core.slopes import Slope, slope
 
 __all__ = [
@@ -41,16 +40,9 @@ class Hierarchy(NamedTuple):
 
     @classmethod
     def of(cls, parameters: Parameters) -> "Hierarchy":
-        """Return views of the high level (``high.*``) and of the bank of sub-skills (``low.*``)."""
+        """Return views of the high level (``high.*``) and of the bank of sub-skills (``low.*``), without graph."""
+        parameters = {name: tensor.detach() for name, tensor in parameters.items()}
         return cls(network(parameters, "high"), bank(parameters, "low"))
-
-    def for_acting(self) -> "Hierarchy":
-        """Return a copy with the weights in the layout in which products with a few states read them fastest."""
-        high, *low = (
-            tuple(Layer(weight.mT.clone(memory_format=torch.contiguous_format).mT, bias) for weight, bias in layers)
-            for layers in (self.high, *self.low)
-        )
-        return Hierarchy(high, tuple(low))
 
     @property
     def parameters(self) -> Parameters:
@@ -81,24 +73,20 @@ class Adapted(NamedTuple):
     low_losses: tuple[float, ...]
 
 
-@torch.no_grad()
 def label(low: Sequence[Network], steps: Steps) -> Int[Tensor, " steps"]:
     """Return for each step the sub-skill that explains its action best, the target of equation 3."""
     return sub_skill_labels(torch.stack([_errors(sub_skill, steps) for sub_skill in low]))
 
 
-@torch.no_grad()
 def _errors(sub_skill: Network, steps: Steps) -> Float[Tensor, " steps"]:
     return squared_errors(mlp(sub_skill, steps.states), steps.actions)
 
 
-@torch.no_grad()
 def choose(high: Network, states: Float[Tensor, "steps obs_dim"]) -> Int[Tensor, " steps"]:
     """Return for each step the sub-skill that the high level takes: argmax_k π_h(k|s)."""
     return mlp(high, states).argmax(-1)
 
 
-@torch.no_grad()
 def act(
     hierarchy: Hierarchy, states: Float[Tensor, "steps obs_dim"]
 ) -> tuple[Float[Tensor, "steps action_dim"], Int[Tensor, " steps"]]:
@@ -114,11 +102,7 @@ def act(
 
 def high_level_slope(high: Network, steps: Steps, labels: Int[Tensor, " steps"], continuity_weight: float) -> Slope:
     """Return L_h of the high level on `steps` (equation 3 with Appendix C's term)."""
-
-    def loss(logits: Tensor) -> Tensor:
-        return high_level_loss(logits, labels, steps.lengths, continuity_weight)
-
-    return slope(high, steps.states, lambda logits: differentiated(loss, logits))
+    return slope(high, steps.states, lambda logits: high_level_loss(logits, labels, steps.lengths, continuity_weight))
 
 
 def sub_skill_slopes(low: Sequence[Network], steps: Steps, chosen: Int[Tensor, " steps"]) -> dict[int, Slope]:

@@ -16,6 +16,7 @@ __all__ = [
     "Steps",
     "behaviour_cloning_loss",
     "continuity_loss",
+    "cross_entropy",
     "differentiated",
     "high_level_loss",
     "squared_errors",
@@ -48,6 +49,14 @@ class OutputLoss(NamedTuple):
     curvature: Callable[[Float[Tensor, "steps outputs"]], Float[Tensor, "steps outputs"]]
     """Multiplies by the Hessian."""
 
+    def plus(self, other: "OutputLoss", weight: float) -> "OutputLoss":
+        """Return this loss plus `weight` times another of the same outputs."""
+        return OutputLoss(
+            self.value + weight * other.value,
+            self.gradient + weight * other.gradient,
+            lambda direction: self.curvature(direction) + weight * other.curvature(direction),
+        )
+
 
 def differentiated(
     loss: Callable[[Float[Tensor, "steps outputs"]], Float[Tensor, ""]], outputs: Float[Tensor, "steps outputs"]
@@ -78,15 +87,32 @@ def sub_skill_labels(errors: Float[Tensor, "sub_skills steps"]) -> Int[Tensor, "
     return errors.argmin(0)
 
 
+def cross_entropy(logits: Float[Tensor, "steps sub_skills"], labels: Int[Tensor, " steps"]) -> OutputLoss:
+    """Return the cross-entropy of π_h to the labels, averaged over the steps (equation 3)."""
+    log_probabilities, steps = logits.log_softmax(-1), len(labels)
+    probabilities = log_probabilities.exp()
+    gradient = probabilities / steps
+    gradient[torch.arange(steps, device=labels.device), labels] -= 1 / steps
+
+    def curvature(direction: Tensor) -> Tensor:
+        weighted = probabilities * direction
+        return (weighted - probabilities * weighted.sum(-1, keepdim=True)) / steps
+
+    return OutputLoss(functional.nll_loss(log_probabilities, labels), gradient, curvature)
+
+
 def high_level_loss(
     logits: Float[Tensor, "steps sub_skills"],
     labels: Int[Tensor, " steps"],
     lengths: Int[Tensor, " trajectories"],
     continuity_weight: float,
-) -> Float[Tensor, ""]:
+) -> OutputLoss:
     """Return the cross-entropy of π_h to the labels (equation 3) plus λ times the continuity loss (Appendix C)."""
-    loss = functional.cross_entropy(logits, labels)
-    return loss + continuity_weight * continuity_loss(logits.softmax(-1), lengths) if continuity_weight else loss
+    loss = cross_entropy(logits, labels)
+    if not continuity_weight:
+        return loss
+    continuity = differentiated(lambda outputs: continuity_loss(outputs.softmax(-1), lengths), logits)
+    return loss.plus(continuity, continuity_weight)
 
 
 def behaviour_cloning_loss(

@@ -21,6 +21,7 @@ __all__ = [
     "Parameters",
     "activations",
     "bank",
+    "blocks",
     "flatten",
     "initialise",
     "mlp",
@@ -101,11 +102,15 @@ def activations(network: Network, inputs: Float[Tensor, "steps inputs"]) -> list
     return [*values, functional.linear(values[-1], *network[-1])]
 
 
+def blocks(values: Float[Tensor, "steps _"]) -> Sequence[Float[Tensor, "block _"]]:
+    """Return views of so many steps at a time as go through all layers together."""
+    return (values,) if len(values) <= BLOCK else values.split(BLOCK)
+
+
 def mlp(network: Network, inputs: Float[Tensor, "steps inputs"]) -> Float[Tensor, "steps outputs"]:
     """Return what the network puts out."""
-    if len(inputs) <= BLOCK:
-        return activations(network, inputs)[-1]
-    return torch.cat([activations(network, block)[-1] for block in inputs.split(BLOCK)])
+    first, *others = (activations(network, block)[-1] for block in blocks(inputs))
+    return torch.cat([first, *others]) if others else first
 
 
 def own_states(chosen: Int[Tensor, " steps"], networks: int) -> list[Int[Tensor, " _"]]:
@@ -115,11 +120,23 @@ def own_states(chosen: Int[Tensor, " steps"], networks: int) -> list[Int[Tensor,
 
 
 def flatten(parameters: Parameters) -> Float[Tensor, " size"]:
-    """Copy all parameters into one vector, in their order."""
-    return torch.cat([tensor.reshape(-1) for tensor in parameters.values()])
+    """Copy all parameters into one vector, in their order; of a matrix, one column after the other.
+
+    So a weight's entries lie in the order in which a product with few states reads them fastest.
+    """
+    return torch.cat(
+        [(tensor.mT if name.endswith(".weight") else tensor).reshape(-1) for name, tensor in parameters.items()]
+    )
 
 
 def unflatten(vector: Float[Tensor, " size"], like: Mapping[str, torch.Size]) -> Parameters:
     """Return views into `vector` with the names and shapes of `like`; the inverse of `flatten`."""
     pieces = vector.split([shape.numel() for shape in like.values()])
-    return {name: piece.view(shape) for (name, shape), piece in zip(like.items(), pieces, strict=True)}
+    views = {}
+    for (name, shape), piece in zip(like.items(), pieces, strict=True):
+        if name.endswith(".weight"):
+            *batch, rows, columns = shape
+            views[name] = piece.view(*batch, columns, rows).mT
+        else:
+            views[name] = piece.view(shape)
+    return views

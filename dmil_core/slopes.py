@@ -3,7 +3,7 @@
 Automatic differentiation twice through an inner loop keeps every intermediate of two graphs, writes each gradient out
 and reads it again to take the step. A perceptron is simple enough to do without: a layer's weight gradient is the
 product δᵀx of what came back and what went in, and a product can be subtracted from a weight while it is computed.
-Only the loss as a function of the network's outputs is left to automatic differentiation.
+What a network and its inputs are is taken as it is: none of them should ask for a gradient.
 """
 
 from collections.abc import Callable
@@ -14,9 +14,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dmil_core.losses import OutputLoss
-from dmil_core.networks import BLOCK, Layer, Network, activations
+from dmil_core.networks import Layer, Network, activations, blocks
 
 __all__ = ["Slope", "slope"]
+
+_relu_backward = torch.ops.aten.threshold_backward.grad_input
 
 
 class Slope(NamedTuple):
@@ -30,7 +32,6 @@ class Slope(NamedTuple):
     outputs: Float[Tensor, "steps outputs"]
     loss: OutputLoss
 
-    @torch.no_grad()
     def add_gradient(self, vector: Network, scale: float = 1.0) -> None:
         """Add `scale` times the gradient to `vector`, in place."""
         for inputs, deltas in zip(self.inputs, self.deltas, strict=True):
@@ -38,14 +39,12 @@ class Slope(NamedTuple):
                 weight.addmm_(delta.mT, value, alpha=scale)
                 bias.add_(delta.sum(0), alpha=scale)
 
-    @torch.no_grad()
     def descend(self, learning_rate: float, *, in_place: bool = False) -> Network:
         """Return the network after one step of gradient descent; in place, this slope's own network is gone."""
         stepped = self.network if in_place else tuple(Layer(*map(torch.clone, layer)) for layer in self.network)
         self.add_gradient(stepped, -learning_rate)
         return stepped
 
-    @torch.no_grad()
     def pull_back(self, vector: Network, learning_rate: float) -> None:
         """Multiply `vector` in place by the Jacobian of `descend`, I − αH, which is symmetric.
 
@@ -54,37 +53,35 @@ class Slope(NamedTuple):
         ReLU's mask, then R{∇W_l} = R{δ_l}ᵀ x_l + δ_lᵀ R{x_l}: six products a layer.
         """
         tangents = [_tangents(self.network, vector, inputs) for inputs in self.inputs]
-        changes = self.loss.curvature(torch.cat([block.pop() for block in tangents])).split(BLOCK)
+        changes = blocks(self.loss.curvature(torch.cat([block.pop() for block in tangents])))
         for index in reversed(range(len(vector))):
-            blocks = list(zip(changes, self.inputs, self.deltas, tangents, strict=True))
+            steps = list(zip(changes, self.inputs, self.deltas, tangents, strict=True))
             if index:
                 changes = [
                     _masked(
                         (change @ self.network[index].weight).addmm_(deltas[index], vector[index].weight), inputs[index]
                     )
-                    for change, inputs, deltas, _ in blocks
+                    for change, inputs, deltas, _ in steps
                 ]
             weight, bias = vector[index]
-            for change, inputs, deltas, tangent in blocks:
+            for change, inputs, deltas, tangent in steps:
                 weight.addmm_(change.mT, inputs[index], alpha=-learning_rate)
                 bias.sub_(change.sum(0), alpha=learning_rate)
                 if index:
                     weight.addmm_(deltas[index].mT, tangent[index - 1], alpha=-learning_rate)
 
 
-@torch.no_grad()
 def slope(
     network: Network,
     inputs: Float[Tensor, "steps inputs"],
     loss: Callable[[Float[Tensor, "steps outputs"]], OutputLoss],
 ) -> Slope:
     """Run a network forward and its loss backward."""
-    values = [activations(network, block) for block in inputs.split(BLOCK)]
+    values = [activations(network, block) for block in blocks(inputs)]
     outputs = torch.cat([block.pop() for block in values])
     at_outputs = loss(outputs)
     deltas = [
-        _deltas(network, block, gradient)
-        for block, gradient in zip(values, at_outputs.gradient.split(BLOCK), strict=True)
+        _deltas(network, block, gradient) for block, gradient in zip(values, blocks(at_outputs.gradient), strict=True)
     ]
     return Slope(network, values, deltas, outputs, at_outputs)
 
@@ -110,4 +107,4 @@ def _tangents(network: Network, vector: Network, inputs: list[Tensor]) -> list[T
 
 def _masked(gradient: Tensor, activation: Tensor) -> Tensor:
     """Multiply in place by the derivative of the ReLU that gave `activation`."""
-    return torch.ops.aten.threshold_backward.grad_input(gradient, activation, 0, grad_input=gradient)
+    return _relu_backward(gradient, activation, 0, grad_input=gradient)

@@ -105,4 +105,4 @@ class Dmil:
             learning_rate=fine_tuning.learning_rate,
             continuity_weight=self.config.continuity_weight,
         )
-        return DmilPolicy(adapted.hierarchy.for_acting(), self.standardise)
+        return DmilPolicy(adapted.hierarchy, self.standardise)

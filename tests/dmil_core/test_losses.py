@@ -57,7 +57,7 @@ def test_label_is_the_sub_skill_with_the_least_squared_error(sub_skills: int) ->
 def test_labels_pass_no_gradient_to_the_sub_skills() -> None:
     predictions, logits = normal(SUB_SKILLS, 6, 2).requires_grad_(), normal(6, SUB_SKILLS).requires_grad_()
     errors = torch.stack([squared_errors(own, normal(6, 2, seed=1)) for own in predictions])
-    loss = high_level_loss(logits, sub_skill_labels(errors), torch.tensor([2, 4]), 0.5)
+    loss = high_level_loss(logits, sub_skill_labels(errors), torch.tensor([2, 4]), 0.0).value
     to_logits, to_predictions = torch.autograd.grad(loss, [logits, predictions], allow_unused=True)
     assert to_logits.abs().sum() > 0
     assert to_predictions is None
@@ -76,7 +76,7 @@ def test_high_level_loss_is_mean_cross_entropy_plus_weighted_switches(weight: fl
             switches += (1 - same) / length / len(lengths)
         start += length
     loss = high_level_loss(logits, labels, torch.tensor(lengths), weight)
-    assert loss.item() == pytest.approx(entropy + weight * switches, rel=1e-12)
+    assert loss.value.item() == pytest.approx(entropy + weight * switches, rel=1e-12)
 
 
 @given(st.integers(1, 9), st.integers(1, 4))
@@ -110,13 +110,14 @@ def test_behaviour_cloning_equals_its_formula_differentiated(steps: int, action_
 
 @pytest.mark.parametrize("weight", [0.0, 0.7])
 @pytest.mark.parametrize("lengths", [[1], [5], [1, 3, 1], [1] * 5], ids=str)
-def test_differentiated_equals_autograd(weight: float, lengths: list[int]) -> None:
+def test_high_level_loss_and_differentiated_equal_autograd(weight: float, lengths: list[int]) -> None:
     """Within no_grad too, as it is used; the curvature against the full Hessian, row by row."""
     logits = normal(sum(lengths), SUB_SKILLS)
     labels = torch.tensor([2, 0, 1, 1, 0])[: len(logits)]
 
     def loss(outputs: torch.Tensor) -> torch.Tensor:
-        return high_level_loss(outputs, labels, torch.tensor(lengths), weight)
+        switches = continuity_loss(outputs.softmax(-1), torch.tensor(lengths))
+        return torch.nn.functional.cross_entropy(outputs, labels) + weight * switches
 
     leaf = logits.clone().requires_grad_()
     value = loss(leaf)
@@ -125,23 +126,24 @@ def test_differentiated_equals_autograd(weight: float, lengths: list[int]) -> No
     hessian = hessian.reshape(logits.numel(), logits.numel())
     before = logits.clone()
     with torch.no_grad():
-        got = differentiated(loss, logits)
-        rows = torch.stack([got.curvature(unit.view_as(logits)).flatten() for unit in torch.eye(len(hessian)).double()])
-    torch.testing.assert_close(got[:2], (value.detach(), gradient), rtol=1e-12, atol=1e-14)
-    torch.testing.assert_close(rows, hessian, rtol=1e-12, atol=1e-14)
+        for got in (differentiated(loss, logits), high_level_loss(logits, labels, torch.tensor(lengths), weight)):
+            units = [unit.view_as(logits) for unit in torch.eye(len(hessian)).double()]
+            rows = torch.stack([got.curvature(unit).flatten() for unit in units])
+            torch.testing.assert_close(got[:2], (value.detach(), gradient), rtol=1e-12, atol=1e-14)
+            torch.testing.assert_close(rows, hessian, rtol=1e-12, atol=1e-14)
+            assert not any(tensor.requires_grad for tensor in (logits, rows, *got[:2]))
     assert hessian.abs().max() > 0.01
     assert torch.equal(logits, before)
-    assert not any(tensor.requires_grad for tensor in (logits, rows, *got[:2]))
 
 
 @pytest.mark.parametrize("closed_form", [True, False])
 def test_curvature_can_be_asked_again(closed_form: bool) -> None:
     outputs, actions = normal(6, SUB_SKILLS), normal(6, SUB_SKILLS, seed=1)
 
-    def loss(logits: torch.Tensor) -> torch.Tensor:
-        return high_level_loss(logits, actions.argmax(-1), torch.tensor([2, 4]), 0.5)
-
-    at = behaviour_cloning_loss(outputs, actions) if closed_form else differentiated(loss, outputs)
+    if closed_form:
+        at = behaviour_cloning_loss(outputs, actions)
+    else:
+        at = high_level_loss(outputs, actions.argmax(-1), torch.tensor([2, 4]), 0.5)
     one, other = normal(6, SUB_SKILLS, seed=2), normal(6, SUB_SKILLS, seed=3)
     before, first = one.clone(), at.curvature(one)
     kept = first.clone()

@@ -10,14 +10,14 @@ from torch.distributions import Independent, Normal
 
 from dmil_core.adaptation import Hierarchy, adapt, choose, high_level_slope, label, sub_skill_slopes
 from dmil_core.losses import Steps
-from dmil_core.networks import Parameters, mlp
+from dmil_core.networks import Parameters, bank, mlp, network
 
 SUB_SKILLS = 3
 
 
 def log_likelihoods(parameters: Parameters, steps: Steps, sigma: float) -> torch.Tensor:
     """log p(a_t | s_t, θ_k) of Gaussian sub-skills, a row for each."""
-    means = torch.stack([mlp(sub_skill, steps.states) for sub_skill in Hierarchy.of(parameters).low])
+    means = torch.stack([mlp(sub_skill, steps.states) for sub_skill in bank(parameters, "low")])
     return Independent(Normal(means, sigma), 1).log_prob(steps.actions)
 
 
@@ -59,7 +59,7 @@ def test_theorem_2_no_assignment_beats_the_label(make_parameters, make_steps, se
     """Equation 24 is linear in p(z|s): its maximum over the simplex is one-hot at the label."""
     parameters, steps = make_parameters(seed % 1000, SUB_SKILLS), make_steps(seed, [20])
     densities = log_likelihoods(parameters, steps, sigma).exp()
-    labels = label(Hierarchy.of(parameters).low, steps)
+    labels = label(bank(parameters, "low"), steps)
     generator = torch.Generator().manual_seed(seed)
     anything = torch.rand(SUB_SKILLS, 20, generator=generator, dtype=torch.float64).pow(3)
     one_hot = torch.nn.functional.one_hot(labels, SUB_SKILLS).T
@@ -92,7 +92,9 @@ def test_theorem_2_the_high_gradients_agree_as_the_sub_skills_get_certain(leaves
     descent = torch.cat([gradient.flatten() for gradient in itertools.chain(*gradient_of(of_loss))])
 
     def gap(sigma: float) -> float:
-        gradients = torch.autograd.grad(log_mixture(leaves, steps, sigma).mean(), list(itertools.chain(*high)))
+        gradients = torch.autograd.grad(
+            log_mixture(leaves, steps, sigma).mean(), list(itertools.chain(*network(leaves, "high")))
+        )
         return ((torch.cat([g.flatten() for g in gradients]) + descent).norm() / descent.norm()).item()
 
     assert gap(1.0) > 0.1
