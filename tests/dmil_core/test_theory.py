@@ -23,7 +23,7 @@ def log_likelihoods(parameters: Parameters, steps: Steps, sigma: float) -> torch
 
 def log_mixture(parameters: Parameters, steps: Steps, sigma: float) -> torch.Tensor:
     """log Σ_k p(z_k | s_t, θ_h) p(a_t | s_t, θ_k), equation 23."""
-    log_p = mlp(Hierarchy.of(parameters).high, steps.states).log_softmax(-1)
+    log_p = mlp(network(parameters, "high"), steps.states).log_softmax(-1)
     return (log_p.T + log_likelihoods(parameters, steps, sigma)).logsumexp(0)
 
 
