@@ -70,6 +70,8 @@ class Arguments:
 
     sizes: tuple[Size, ...] = ("quick", "paper")
     """Networks, batches and windows of the presets ml10-quick and ml10-paper."""
+    rounds: int | None = None
+    """Turns that each takes; by default 6 at quick size and 2 at paper size."""
     json: Path | None = None
     """File for the rows."""
     simulate: int | None = None
@@ -308,12 +310,13 @@ def run(arguments: Sequence[str]) -> None:
     runner = RayRunner(MetaWorldSuite(PRESETS["ml10-quick"].suite), sum(WORKERS))
     try:
         for size in given.sizes:
-            plan = made_up_plan(size)
-            console.print(f"{size}: {TURNS[size].rounds} rounds of {TURNS[size].iterations} iterations")
+            plan, turns = made_up_plan(size), TURNS[size]
+            turns = turns._replace(rounds=given.rounds or turns.rounds)
+            console.print(f"{size}: {turns.rounds} rounds of {turns.iterations} iterations")
             trainings: dict[str, MetaTraining] = {"local": LocalMetaTraining(plan)}
             by_ray = {f"ray {workers}": RayMetaTraining(plan, workers) for workers in WORKERS}
             trainings |= by_ray
-            timings = measure(trainings, TURNS[size])
+            timings = measure(trainings, turns)
             rows += rows_of(size, trainings, timings)
             if given.simulate:
                 one = f"ray {WORKERS[0]}"

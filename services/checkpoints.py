@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import UserError
+from dmil_core.networks import flatten
 from dmil_core.outer_loop import OuterState
 
 __all__ = ["Checkpoint", "CheckpointError", "Checkpoints", "Manifest"]
@@ -78,7 +80,7 @@ class Checkpoint:
     @property
     def state(self) -> OuterState:
         """The learner's state."""
-        flat = np.concatenate([array.reshape(-1) for array in self.parameters.values()])
+        flat = flatten({name: torch.from_numpy(array) for name, array in self.parameters.items()}).numpy()
         return OuterState(self.manifest.iteration, flat, **self._load("optimiser.safetensors"))
 
     @property

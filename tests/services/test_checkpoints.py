@@ -4,8 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from dmil_core.configs import ExperimentConfig
+from dmil_core.networks import unflatten
 from dmil_core.outer_loop import OuterState, OuterStep, add
 from services.checkpoints import Checkpoint, CheckpointError, Checkpoints, Manifest
 
@@ -29,8 +31,8 @@ def start() -> OuterState:
 
 
 def save(checkpoints: Checkpoints, state: OuterState, loss: float | None = None) -> Path:
-    pieces = np.split(state.parameters, np.cumsum([np.prod(shape) for shape in SHAPES.values()])[:-1])
-    parameters = {name: piece.reshape(shape) for (name, shape), piece in zip(SHAPES.items(), pieces, strict=True)}
+    shapes = {name: torch.Size(shape) for name, shape in SHAPES.items()}
+    parameters = {name: t.numpy() for name, t in unflatten(torch.tensor(state.parameters), shapes).items()}
     manifest = Manifest(
         iteration=state.iteration,
         loss=loss,

@@ -1,0 +1,60 @@
+"""Each benchmark runs, small, and its rows have the columns that others read."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+PROJECT = Path(__file__).parents[2]
+
+
+def rows_of(program: str, *arguments: str, folder: Path) -> list[dict[str, Any]]:
+    command = [sys.executable, "-m", f"benchmarks.{program}", *arguments, "--json", str(folder / "rows.json")]
+    subprocess.run(command, cwd=PROJECT, check=True, capture_output=True)
+    return json.loads((folder / "rows.json").read_text())
+
+
+def test_meta_gradient(tmp_path: Path) -> None:
+    flags = ["--sizes", "quick", "--sub-skills", "2", "3", "--orders", "second", "--rounds", "1"]
+    rows = rows_of("meta_gradient", *flags, folder=tmp_path)
+    assert [(row["size"], row["order"], row["k"]) for row in rows] == [("quick", "second", 2), ("quick", "second", 3)]
+    for row in rows:
+        assert row["ratio"] == pytest.approx(row["twin_seconds"] / row["seconds"])
+        assert row["roofline_share"] > 0
+        assert 100 < row["peak_mb"] < 1500
+        assert row["forwards"] == pytest.approx(4 * row["k"] + 64, rel=0.1), "the count of work of own states only"
+        assert row["relative_error"] < 1e-5
+
+
+def test_adaptation(tmp_path: Path) -> None:
+    rows = rows_of("adaptation", "--fine-tuning-steps", "2", "--rounds", "1", folder=tmp_path)
+    assert [row["what"] for row in rows] == ["adapt, 1 shot, 2 steps", "act in 1 state", "act in 20 states"]
+    assert all(row["seconds"] > 0 and row["twin_seconds"] > 0 for row in rows)
+
+
+@pytest.mark.slow
+def test_simulation(tmp_path: Path) -> None:
+    rows = rows_of("simulation", "--quick", folder=tmp_path)
+    *steps, evaluation = rows
+    assert evaluation["task"] == "evaluation"
+    assert evaluation["ratio"] > 0
+    assert len(steps) == 2
+    for row in steps:
+        assert row["ratio"] == pytest.approx(row["ours_steps_per_s"] / row["stock_steps_per_s"])
+        assert row["physics_steps_per_s"] > 0
+
+
+@pytest.mark.slow
+def test_scaling(tmp_path: Path) -> None:
+    rows = rows_of("scaling", "--sizes", "quick", "--rounds", "1", "--simulate", "100", folder=tmp_path)
+    assert [(row["runner"], row["workers"], row["size"]) for row in rows] == [
+        ("local", 1, "quick"),
+        ("ray", 1, "quick"),
+        ("ray", 2, "quick"),
+    ]
+    for row in rows:
+        assert 0 <= row["overhead_share"] < 1
+        assert row["speedup"] == pytest.approx(row["iterations_per_s"] / rows[1]["iterations_per_s"])
