@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn import functional
 
 __all__ = [
     "BLOCK",
@@ -97,9 +96,10 @@ BLOCK = 320
 def activations(network: Network, inputs: Float[Tensor, "steps inputs"]) -> list[Float[Tensor, "steps _"]]:
     """Return what goes into each layer, and last what the network puts out."""
     values = [inputs]
-    for layer in network[:-1]:
-        values.append(functional.linear(values[-1], *layer).relu_())
-    return [*values, functional.linear(values[-1], *network[-1])]
+    for weight, bias in network[:-1]:
+        values.append(torch.mm(values[-1], weight.mT).add_(bias).relu_())
+    weight, bias = network[-1]
+    return [*values, torch.mm(values[-1], weight.mT).add_(bias)]
 
 
 def blocks(values: Float[Tensor, "steps _"]) -> Sequence[Float[Tensor, "block _"]]:

@@ -98,7 +98,7 @@ def _tangents(network: Network, vector: Network, inputs: list[Tensor]) -> list[T
     """Return the derivative along `vector` of what each layer puts out, R{x_{l+1}}, and last R{z_L}."""
     tangents: list[Tensor] = []
     for index, ((weight, _), (along, along_bias)) in enumerate(zip(network, vector, strict=True)):
-        tangent = torch.addmm(along_bias, inputs[index], along.mT)
+        tangent = torch.mm(inputs[index], along.mT).add_(along_bias)
         if index:
             tangent.addmm_(tangents[-1], weight.mT)
         tangents.append(_masked(tangent, inputs[index + 1]) if index + 1 < len(network) else tangent)
