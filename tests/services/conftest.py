@@ -181,8 +181,11 @@ class Programs:
 
 
 @pytest.fixture
-def programs(workplace: Path) -> Programs:
-    return Programs()
+def programs(workplace: Path) -> Iterator[Programs]:
+    # A shell has what it starts in the background ignore Ctrl-C, and so would the programs.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield Programs()
+    signal.signal(signal.SIGINT, before)
 
 
 QUICK_EVALUATION = ("--evaluation.shots", "1", "--evaluation.episodes", "1", "--evaluation.fine-tuning-steps", "1")
