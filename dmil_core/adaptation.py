@@ -92,7 +92,7 @@ def act(
 ) -> tuple[Float[Tensor, "steps action_dim"], Int[Tensor, " steps"]]:
     """Return for each state the action of the sub-skill that the high level takes, and which one that is."""
     chosen = choose(hierarchy.high, states)
-    first, *others = set(chosen.tolist())
+    first, *others = set(chosen.tolist()) or {0}  # no states are an answer too
     if not others:
         return mlp(hierarchy.low[first], states), chosen
     own = own_states(chosen, len(hierarchy.low))

@@ -366,3 +366,9 @@ def test_a_sub_skill_that_is_never_chosen_stays(parameters, support) -> None:
     for k in (0, 2):
         assert all(map(torch.equal, sub_skill(adapted, k), sub_skill(parameters, k)))
     assert not any(map(torch.equal, sub_skill(adapted, 1), sub_skill(parameters, 1)))
+
+
+def test_acting_in_no_states_is_no_action(parameters, support) -> None:
+    actions, chosen = act(Hierarchy.of(parameters), support[0].states[:0])
+    assert actions.shape == (0, support[0].actions.shape[1])
+    assert len(chosen) == 0
