@@ -8,13 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dmil_core.losses import (
-    Steps,
-    behaviour_cloning_loss,
-    high_level_loss,
-    squared_errors,
-    sub_skill_labels,
-)
+from dmil_core.losses import Steps, behaviour_cloning_loss, high_level_loss, squared_errors, sub_skill_labels
 from dmil_core.networks import Network, Parameters, bank, mlp, network, own_states, stacked
 from dmil_core.slopes import Slope, slope
 

@@ -3,7 +3,7 @@
 Automatic differentiation twice through an inner loop keeps every intermediate of two graphs, writes each gradient out
 and reads it again to take the step. A perceptron is simple enough to do without: a layer's weight gradient is the
 product δᵀx of what came back and what went in, and a product can be subtracted from a weight while it is computed.
-What a network and its inputs are is taken as it is: none of them should ask for a gradient.
+Neither the networks nor their inputs may ask autograd for a gradient.
 """
 
 from collections.abc import Callable
