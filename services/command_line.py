@@ -13,7 +13,7 @@ import yaml
 from pydantic import ValidationError
 
 from dmil_core.configs import PRESETS, EvaluationConfig, ExperimentConfig
-from dmil_core.errors import UserError
+from dmil_core.errors import RunError, UserError
 
 __all__ = [
     "ConfigError",
@@ -126,7 +126,10 @@ def parse(program: type[T], description: str, arguments: Sequence[str], defaults
 
 
 def exit_code(program: Callable[[Sequence[str]], None], arguments: Sequence[str]) -> int:
-    """Run a program and return its exit code: 2 for the user's mistake, 130 and 143 for Ctrl-C and SIGTERM."""
+    """Run a program and return its exit code.
+
+    2 for the user's mistake, 1 for what stops a run otherwise, 130 and 143 for Ctrl-C and SIGTERM.
+    """
     received: list[int] = []
 
     def terminate(number: int, frame: object) -> NoReturn:
@@ -136,9 +139,9 @@ def exit_code(program: Callable[[Sequence[str]], None], arguments: Sequence[str]
     signal.signal(signal.SIGTERM, terminate)
     try:
         program(arguments)
-    except UserError as error:
+    except (UserError, RunError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return 2
+        return 2 if isinstance(error, UserError) else 1
     except KeyboardInterrupt:
         return 143 if received else 130
     return 0

@@ -25,6 +25,7 @@ FLOORS = {
     "dmil_core.outer_loop": 2,
     "services.suites": 3,
     "services.demo_store": 3,
+    "services.disk": 3,
     "services.checkpoints": 3,
     "services.tracking": 3,
     "services.progress": 3,

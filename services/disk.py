@@ -1,0 +1,109 @@
+"""Files on disk: written whole or not at all, and read only as far as is sane."""
+
+import errno
+import os
+import shutil
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from dmil_core.errors import RunError
+
+__all__ = ["DiskFullError", "inside", "read_file", "room_for", "sync", "write_file"]
+
+FULL = {errno.ENOSPC, errno.EDQUOT}
+FULL_IN_WORDS = ("No space left on device", "Disk quota exceeded", "os error 28", "errno = 28")
+"""How libraries that write by themselves say it."""
+
+
+class DiskFullError(RunError):
+    """A disk without room for what is to be written."""
+
+
+@contextmanager
+def room_for(path: Path, needed: int) -> Iterator[None]:
+    """Write something inside, whose failure for want of space is told in words.
+
+    Args:
+        path: what is written; its folder need not exist yet.
+        needed: bytes.
+
+    Raises:
+        DiskFullError: if they are not there before, or run out meanwhile.
+    """
+    there = next(folder for folder in path.absolute().parents if folder.exists())
+    free = shutil.disk_usage(there).free
+    try:
+        if free < needed:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        yield
+    except Exception as error:
+        if not _for_want_of_space(error):
+            raise
+        raise DiskFullError(
+            f"{path}: needs {needed} bytes, its disk had {free} free; nothing half-written is kept; make room, then "
+            "start again: a run goes on with --resume"
+        ) from error
+
+
+def _for_want_of_space(error: Exception) -> bool:
+    return (isinstance(error, OSError) and error.errno in FULL) or any(words in str(error) for words in FULL_IN_WORDS)
+
+
+def write_file(path: Path, content: str | bytes) -> None:
+    """Write a file beside, sync it and rename it: whoever reads `path` finds what it was, or all of the new content.
+
+    Raises:
+        DiskFullError: for want of space; `path` is then what it was.
+    """
+    data = content.encode() if isinstance(content, str) else content
+    beside = path.with_name(f".{path.name}.writing")
+    with room_for(path, len(data)):
+        try:
+            with beside.open("wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            beside.replace(path)
+        except OSError:
+            beside.unlink(missing_ok=True)
+            raise
+        sync(path.parent)
+
+
+def sync(path: Path) -> None:
+    """Have a file's content, or a folder's list of files, reach the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def read_file(path: Path, most: int) -> bytes:
+    """Return the content of a regular file of at most `most` bytes.
+
+    Raises:
+        OSError: for anything else: nothing there, a folder, a device that never ends, a larger file.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe without a writer would wait for ever
+    with os.fdopen(descriptor, "rb") as file:
+        found = os.fstat(descriptor)
+        if not stat.S_ISREG(found.st_mode):
+            raise OSError(errno.EINVAL, "got no regular file", str(path))
+        if found.st_size > most:
+            raise OSError(errno.EFBIG, f"got {found.st_size} bytes, at most {most} are read", str(path))
+        return file.read(most)
+
+
+def inside(root: Path, name: str) -> Path:
+    """Return the path `name` under `root`, with all links followed.
+
+    Raises:
+        OSError: if it lies elsewhere: an absolute path, one with ``..`` or a link that leads out.
+    """
+    path = (root / name).resolve()
+    if not path.is_relative_to(root.resolve()):
+        raise OSError(errno.EPERM, f"lies outside {root}", name)
+    return path
