@@ -91,6 +91,11 @@ class TaskBatch:
         """The four sets in the order of Algorithm 1: τ1, τ2, τ3, τ4."""
         return self.support_high, self.support_low, self.query_high, self.query_low
 
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """The ids of all demonstrations, set by set."""
+        return tuple(demonstration.id for demonstrations in self.sets for demonstration in demonstrations)
+
 
 def sample_task_batch(
     demonstrations: Sequence[Demonstration], trajectories: int, window: int | None, stream: np.random.Generator

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration
-from dmil_core.meta_gradient import tree_sum
+from dmil_core.errors import piece_of_work
+from dmil_core.meta_gradient import TaskGradient, tree_sum
 from dmil_core.methods.base import MetaLearner
 from dmil_core.networks import Parameters
 from dmil_core.seeding import stream
@@ -20,10 +21,12 @@ __all__ = [
     "GroupGradient",
     "OuterState",
     "OuterStep",
+    "SpoiltSlot",
     "add",
     "blocks",
     "group_gradient",
     "groups",
+    "slot_in_words",
     "tasks_of",
 ]
 
@@ -31,11 +34,22 @@ BLOCKS_PER_WORKER = 4
 """Blocks that each worker should find at least, so that a slow one takes fewer and the others do not wait."""
 
 
+class SpoiltSlot(NamedTuple):
+    """A slot with a loss or a gradient that is not finite."""
+
+    slot: int
+    task: str
+    demonstrations: tuple[str, ...]
+    """Ids of those that it had drawn."""
+
+
 class GroupGradient(NamedTuple):
     """The sum of a group's outer gradients, and the metrics of each of its slots."""
 
     gradient: Float32[np.ndarray, " size"]
     metrics: list[Mapping[str, float]]
+    spoilt: list[SpoiltSlot]
+    """Where there is one, no number of the gradient's is finite."""
 
 
 class OuterState(NamedTuple):
@@ -104,14 +118,33 @@ def group_gradient(
         iteration: counts from 0.
         tasks: the task of every slot of the iteration, see `tasks_of`.
         slots: which of them to compute.
+
+    Raises:
+        WorkError: for a Python error in one of them, which is named.
     """
-    results = [
-        method.task_gradient(
-            parameters, method.sample(demonstrations[tasks[slot]], stream(seed, "batch", iteration, slot))
-        )
-        for slot in slots
-    ]
-    return GroupGradient(tree_sum([result.gradient for result in results]).numpy(), [r.metrics for r in results])
+    terms, metrics, spoilt = [], [], []
+    for slot in slots:
+        task = tasks[slot]
+        with piece_of_work(slot_in_words(iteration, slot, task, seed), iteration=iteration, slot=slot):
+            material = method.sample(demonstrations[task], stream(seed, "batch", iteration, slot))
+            result = method.task_gradient(parameters, material)
+        if not _finite(result):
+            spoilt.append(SpoiltSlot(slot, task, tuple(material.ids)))
+        terms.append(result.gradient)
+        metrics.append(result.metrics)
+    gradient = torch.full_like(terms[0], torch.nan) if spoilt else tree_sum(terms)
+    return GroupGradient(gradient.numpy(), metrics, spoilt)
+
+
+def slot_in_words(iteration: int, slot: int, task: str, seed: int) -> str:
+    """Name a slot in messages, where iterations count from 1."""
+    return f"iteration {iteration + 1}, slot {slot}, task {task}, seed {seed}"
+
+
+def _finite(result: TaskGradient) -> bool:
+    """Tell whether all is finite; the sum, which nearly always is then, is cheaper to look at."""
+    gradient = bool(result.gradient.sum().isfinite() or result.gradient.isfinite().all())
+    return gradient and all(map(np.isfinite, result.metrics.values()))
 
 
 class OuterStep:
@@ -140,11 +173,19 @@ class OuterStep:
         return self._parameters.detach()
 
     def __call__(self, gradient: Float32[np.ndarray, " size"]) -> float:
-        """Take one step by the sum of all slots' gradients, and return its norm before clipping."""
+        """Take one step by the sum of all slots' gradients, and return its norm before clipping.
+
+        Where that is not finite, nothing changes.
+        """
         self._parameters.grad = torch.tensor(gradient)
         norm = torch.nn.utils.clip_grad_norm_([self._parameters], float("inf") if self._clip is None else self._clip)
-        self._adam.step()
+        if norm.isfinite():
+            self._adam.step()
         return norm.item()
+
+    def skip(self) -> None:
+        """Count an iteration whose step is not taken; parameters and moments stay."""
+        self._adam.state[self._parameters]["step"] += 1
 
     @property
     def state(self) -> OuterState:

@@ -26,6 +26,16 @@ class Trial(NamedTuple):
     draw: int
     episodes: tuple[int, ...]
 
+    @property
+    def in_words(self) -> str:
+        """Its name in messages."""
+        return f"{self.split} task {self.task}, {self.shots}-shot, support set {self.draw}"
+
+    @property
+    def piece(self) -> dict[str, str | int]:
+        """What names it among all trials."""
+        return {"split": self.split, "task": self.task, "shots": self.shots, "draw": self.draw}
+
     def support(self, held_out: Sequence[Demonstration]) -> Sequence[Demonstration]:
         """Return this draw's support set: draws of one size are disjoint."""
         return held_out[self.draw * self.shots : (self.draw + 1) * self.shots]

@@ -11,7 +11,7 @@ import torch
 from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import MetaLearner
-from dmil_core.outer_loop import OuterState, groups, tasks_of
+from dmil_core.outer_loop import OuterState, SpoiltSlot, groups, tasks_of
 from services.actors.adaptation import AdaptationWorker
 from services.actors.learner import Learner
 from services.actors.simulation import SimulationWorker
@@ -32,6 +32,8 @@ class Plan(NamedTuple):
     state: OuterState
     settings: TrainingConfig
     seed: int
+    skip_nonfinite: bool = False
+    """Whether an iteration whose step is not taken, for its gradient was not finite, counts as done."""
 
     def tasks(self, iteration: int) -> list[str]:
         """Return the task of each slot of an iteration."""
@@ -45,8 +47,10 @@ class Iteration(NamedTuple):
     """Outer steps done, this one included."""
     slots: list[Mapping[str, float]]
     """The metrics of each slot."""
+    spoilt: list[SpoiltSlot]
+    """Those with a loss or a gradient that is not finite."""
     gradient_norm: float
-    """Before clipping."""
+    """Before clipping; where it is not finite, no step was taken."""
     timing: Timing
 
 
@@ -81,7 +85,10 @@ class Simulation(Protocol):
 class Runner(Protocol):
     """Does an experiment's work, wherever that is."""
 
-    workers: int
+    @property
+    def workers(self) -> int:
+        """How many workers of each kind there may be now."""
+        ...
 
     def share(self, value: Any) -> Any:
         """Return what to pass in calls instead of `value`, so that it travels once."""
@@ -154,7 +161,7 @@ class LocalMetaTraining:
     def __init__(self, plan: Plan) -> None:
         """Start from the plan's state."""
         self._plan, self._next = plan, plan.state.iteration
-        self._learner = Learner(plan.state, plan.settings)
+        self._learner = Learner(plan.state, plan.settings, skip_nonfinite=plan.skip_nonfinite)
         self._worker = AdaptationWorker(plan.method, plan.shapes, plan.demonstrations, plan.seed)
         self._ready, self._parameters = self._learner.parameters()
 
@@ -167,7 +174,7 @@ class LocalMetaTraining:
                 stepped, self._parameters = self._learner.step(gradient)
             timing = Timing.of(self._ready, {0: [report.span]}, stepped.span)
             self._next, self._ready = self._next + 1, stepped.span.ended
-            yield Iteration(self._next, report.metrics, stepped.gradient_norm, timing)
+            yield Iteration(self._next, report.metrics, report.spoilt, stepped.gradient_norm, timing)
 
     def state(self) -> OuterState:
         """Return the learner's state."""

@@ -21,9 +21,20 @@ from dmil_core.demonstrations import Demonstration
 from dmil_core.meta_gradient import TaskGradient
 from dmil_core.networks import Parameters
 
-__all__ = ["Decision", "FineTuning", "MetaLearner", "Method", "Policy", "SubSkillUse"]
+__all__ = ["Decision", "Drawn", "FineTuning", "MetaLearner", "Method", "Policy", "SubSkillUse"]
 
-Material = TypeVar("Material")
+
+@runtime_checkable
+class Drawn(Protocol):
+    """What one slot of an iteration learns from."""
+
+    @property
+    def ids(self) -> Sequence[str]:
+        """The ids of the demonstrations in it."""
+        ...
+
+
+Material = TypeVar("Material", bound=Drawn)
 
 
 class Decision(NamedTuple):

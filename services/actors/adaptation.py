@@ -9,7 +9,7 @@ import torch
 from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import MetaLearner
 from dmil_core.networks import unflatten
-from dmil_core.outer_loop import add, group_gradient
+from dmil_core.outer_loop import SpoiltSlot, add, group_gradient
 from services.actors.freight import Freight, pack, unpack
 from services.timing import Span
 
@@ -21,6 +21,7 @@ class BlockReport(NamedTuple):
 
     metrics: list[Mapping[str, float]]
     """Of each of its slots."""
+    spoilt: list[SpoiltSlot]
     span: Span
 
 
@@ -54,6 +55,9 @@ class AdaptationWorker:
             tasks: of every slot of the iteration.
             block: the slots of each of its groups.
             before: Ray's references to the gradients of the blocks just before, which are then added.
+
+        Raises:
+            WorkError: for a Python error in one of the slots.
         """
         began = time.perf_counter()
         own = unflatten(torch.from_numpy(unpack(parameters)), self._shapes)
@@ -63,7 +67,8 @@ class AdaptationWorker:
         ]
         gradient = add([result.gradient for result in results])
         metrics = [slot for result in results for slot in result.metrics]
-        report = BlockReport(metrics, Span(began, time.perf_counter()))
+        spoilt = [slot for result in results for slot in result.spoilt]
+        report = BlockReport(metrics, spoilt, Span(began, time.perf_counter()))
         if not before:
             return report, pack(gradient)
         import ray  # the local runner, which never comes here, does without

@@ -1,5 +1,6 @@
 """The actor that takes the outer step: the only one with state."""
 
+import math
 import time
 from typing import NamedTuple
 
@@ -17,16 +18,23 @@ class StepReport(NamedTuple):
     """What is told of an outer step beside the new parameters."""
 
     gradient_norm: float
-    """Before clipping."""
+    """Before clipping; where it is not finite, the step was not taken."""
     span: Span
 
 
 class Learner:
     """Holds the parameters and Adam's moments."""
 
-    def __init__(self, state: OuterState, training: TrainingConfig) -> None:
-        """Continue from `state`."""
+    def __init__(self, state: OuterState, training: TrainingConfig, *, skip_nonfinite: bool = False) -> None:
+        """Continue from `state`.
+
+        Args:
+            state: where to go on.
+            training: settings of the outer loop.
+            skip_nonfinite: whether an iteration without a step, for its gradient was not finite, counts as done.
+        """
         torch.set_num_threads(1)
+        self._skip = skip_nonfinite
         self._step = OuterStep(state, training.learning_rate, training.gradient_clip)
 
     def parameters(self) -> tuple[float, Freight]:
@@ -37,6 +45,8 @@ class Learner:
         """Step by the sum of all gradients; return the report and the new parameters."""
         began = time.perf_counter()
         norm = self._step(unpack(gradient))
+        if self._skip and not math.isfinite(norm):
+            self._step.skip()
         ended, parameters = self.parameters()
         return StepReport(norm, Span(began, ended)), parameters
 

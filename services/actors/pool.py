@@ -1,23 +1,34 @@
 """Keeps a pool of actors busy and alive; knows nothing of their work."""
 
-from collections import deque
+import bisect
+import time
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from statistics import median
 from typing import Any
 
 import ray
-from ray.exceptions import ActorDiedError, ActorUnavailableError, GetTimeoutError
+from ray.exceptions import ObjectLostError, RayActorError, RayError, RayTaskError
 
-from dmil_core.errors import UserError
+from dmil_core.errors import RunError
+from services.actors.faults import DeadlyCallError, LostError, NoRoomError
 
-__all__ = ["Call", "NoRoomError", "Pool"]
+__all__ = ["Call", "Pool"]
 
 PLACEMENT_SECONDS = 120
 DEATHS_ALLOWED = 3
-"""A call that ends so many actors is given up: it is the call that kills them."""
-
-
-class NoRoomError(UserError):
-    """More actors were asked for than the cluster has room for."""
+"""A call in whose course so many actors ended is suspected to end them."""
+SLOWNESS = 10
+"""A call that takes so many times what its like take is also given to another actor."""
+LEAST_SECONDS = 2.0
+"""But not before: a spare actor takes some seconds to start."""
+FIRST_SECONDS = 60.0
+"""What a call may take before it is known what its like take."""
+OWN_SECONDS = 30.0
+"""Nor before that where the actor is one of one's own: to lose it costs more."""
+PEERS = 3
+"""Calls of one method that must have ended for it to be known what its like take; the last hundred count."""
+WATCH_SECONDS = 0.5
 
 
 class Call:
@@ -28,68 +39,115 @@ class Call:
     """
 
     def __init__(
-        self, method: str, arguments: tuple[Any, ...], returns: int, beside: "Call | None", actor: Any | None
+        self,
+        number: int,
+        method: str,
+        arguments: tuple[Any, ...],
+        returns: int,
+        beside: "Call | None",
+        on: Any | None,
+        label: str,
     ) -> None:
         """See `Pool.submit`."""
-        self.method, self.arguments, self.returns = method, arguments, returns
-        self.beside = beside
-        self.actor: Any = actor
-        self.worker: int | None = None
-        """The number of the pool's actor that it runs on; none if that is an actor of one's own."""
+        self.number, self.method, self.arguments, self.returns = number, method, arguments, returns
+        self.beside, self.on, self.label = beside, on, label
+        self.worker: Worker | None = None
+        """The pool's actor that it runs on; none if that is an actor of one's own, or it is not sent yet."""
         self.references: list[ray.ObjectRef] = []
         """Of its results, once it is under way."""
+        self.began: float | None = None
+        """When it was seen to be at work: first in its actor's queue, with all that it is built upon."""
         self.done = False
         self.value: Any = None
         """Its first result, once it is done."""
         self.deaths = 0
+        self.spare: Worker | None = None
+        """An actor that does the same, where its own is slow."""
+        self.twin: list[ray.ObjectRef] = []
+        """References to the spare's results."""
 
     @property
-    def can_begin(self) -> bool:
-        """Whether all that it builds upon is under way."""
-        calls = (call for given in self.arguments for call in (given if isinstance(given, list) else [given]))
-        return all(call.references for call in calls if isinstance(call, Call))
+    def built_upon(self) -> Iterator["Call"]:
+        """The calls among its arguments."""
+        parts = (part for given in self.arguments for part in (given if isinstance(given, list) else [given]))
+        return (part for part in parts if isinstance(part, Call))
+
+
+class Worker:
+    """One of the pool's actors: the process may be another one after a death, the number stays."""
+
+    def __init__(self, number: int, actor: Any) -> None:
+        """Take an actor that was just started."""
+        self.number, self.actor = number, actor
+        self.up = False
+        self.calls: list[Call] = []
+        """Sent and not ended, in their order."""
+
+    @property
+    def load(self) -> int:
+        """How many of its calls were put here because there was room."""
+        return sum(call.beside is None for call in self.calls)
 
 
 class Pool:
-    """Stateless actors of one kind. A call whose actor dies is made again on its replacement.
+    """Stateless actors of one kind. A call whose actor dies is made again, on whichever actor has room.
 
     Calls are sent in the order in which they are submitted, and may build upon the results of others that are still
     under way: those go from actor to actor, and whoever submits need not wait. If a call is lost, all that build upon
-    it fail with it, and are made again too.
+    it fail with it, and are made again too. A call that takes far longer than its like is also given to a spare actor:
+    the first answer counts, for they are equal, and whoever was slower is ended.
     """
 
-    def __init__(self, make: Callable[[], Any], size: int, ahead: int = 1) -> None:
+    def __init__(
+        self, make: Callable[[], Any], size: int, ahead: int = 1, say: Callable[[str], None] = lambda words: None
+    ) -> None:
         """Start `size` actors and wait until all are up.
 
         Args:
             make: starts one.
             size: how many.
             ahead: calls that an actor may hold at a time. With 2 it has its next one at hand when it ends one.
+            say: is told of actors lost, slow and replaced.
 
         Raises:
             NoRoomError: if the cluster cannot place them.
         """
-        self._make, self._ahead = make, ahead
-        self._actors = [make() for _ in range(size)]
-        self._held = [0] * size
-        self._waiting: deque[Call] = deque()
+        self._make, self._ahead, self._say = make, ahead, say
+        self._workers: list[Worker] = []
+        self._starting: dict[ray.ObjectRef, Worker] = {}
+        self._waiting: list[Call] = []
         self._running: dict[ray.ObjectRef, Call] = {}
+        self._seconds: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=100))
+        self._submitted = self._failed_starts = 0
+        self._manned = time.monotonic()
+        """When an actor was last seen to be up."""
         self.restarts = 0
-        try:
-            ray.get([actor.__ray_ready__.remote() for actor in self._actors], timeout=PLACEMENT_SECONDS)
-        except GetTimeoutError as error:
-            self.close()
-            raise NoRoomError(
-                f"workers: got {size}, not all placed after {PLACEMENT_SECONDS} s; the cluster has "
-                f"{ray.cluster_resources().get('CPU', 0):.0f} CPUs, {ray.available_resources().get('CPU', 0):.0f} "
-                "free; ask for fewer or wait for other jobs to end"
-            ) from error
+        """How many actors died or were ended for slowness, and replaced."""
+        self.grow(size)
+        until = time.monotonic() + PLACEMENT_SECONDS
+        while self._starting:
+            self._settle([])
+            if time.monotonic() > until:
+                self.close()
+                raise _no_room(size)
 
     def __len__(self) -> int:
-        return len(self._actors)
+        """How many actors are up."""
+        return sum(worker.up for worker in self._workers)
+
+    def grow(self, size: int) -> None:
+        """Start actors until there are `size`, without waiting for them; they get calls as soon as they are up."""
+        for number in range(len(self._workers), size):
+            self._workers.append(self._start(number))
 
     def submit(
-        self, method: str, *arguments: Any, returns: int = 1, beside: Call | None = None, on: Any | None = None
+        self,
+        method: str,
+        *arguments: Any,
+        returns: int = 1,
+        beside: Call | None = None,
+        on: Any | None = None,
+        label: str = "",
     ) -> Call:
         """Have a method called, as soon as there is an actor for it.
 
@@ -99,9 +157,11 @@ class Pool:
             returns: how many results it has. The first is fetched, the others stay object references.
             beside: the call on whose actor it is to run, however busy that is; by default the least busy one.
             on: an actor that is not the pool's, and is not replaced if it dies.
+            label: what it is, in messages.
         """
-        call = Call(method, arguments, returns, beside, on)
-        self._waiting.append(call)
+        call = Call(self._submitted, method, arguments, returns, beside, on, label or method)
+        self._submitted += 1
+        self._queue(call)
         self._send_waiting()
         return call
 
@@ -109,18 +169,20 @@ class Pool:
         """Wait until a call is done, and return its first result.
 
         Raises:
-            ActorDiedError: if a call ends three actors one after the other, or an actor of one's own.
+            DeadlyCallError: if three actors end one after the other in the course of some call.
+            LostError: if an actor of one's own is gone, or a result that a call is built upon.
+            NoRoomError: if no actor is left, and none can be placed.
         """
         while not call.done:
             # Those that wait want to be sent as soon as any call ends; else only this one matters.
-            self._settle(self._running if self._waiting else call.references[:1])
+            self._settle(self._running if self._waiting else [*call.references[:1], *call.twin[:1]])
         return call.value
 
     def results(self, calls: Sequence[Call]) -> Iterator[tuple[int, Any]]:
         """Yield each call's index and first result as they come.
 
         Raises:
-            ActorDiedError: as `result`.
+            DeadlyCallError: as `result`, and the others.
         """
         left = dict(enumerate(calls))
         while left:
@@ -129,77 +191,230 @@ class Pool:
             if left:
                 self._settle(self._running)
 
-    def map(self, method: str, calls: Iterable[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
+    def map(
+        self, method: str, calls: Iterable[tuple[Any, ...]], label: Callable[..., str] = lambda *arguments: ""
+    ) -> Iterator[tuple[int, Any]]:
         """Call `method` once with each tuple of arguments; yield each call's index and result as they come.
 
+        Args:
+            method: of the actors.
+            calls: the arguments of each call.
+            label: says of its arguments what a call is, in messages.
+
         Raises:
-            ActorDiedError: as `result`.
+            DeadlyCallError: as `result`, and the others.
         """
-        yield from self.results([self.submit(method, *arguments) for arguments in calls])
+        yield from self.results([self.submit(method, *arguments, label=label(*arguments)) for arguments in calls])
 
     def take_note(self) -> None:
-        """Take note of all that has ended by now, without waiting."""
-        if self._running:
-            ended, _ = ray.wait(list(self._running), num_returns=len(self._running), timeout=0, fetch_local=False)
+        """Take note of all that has ended by now, without waiting, and see to what goes on too long."""
+        watched = [*self._running, *self._starting]
+        if watched:
+            ended, _ = ray.wait(watched, num_returns=len(watched), timeout=0, fetch_local=False)
             for reference in ended:
-                self._end(self._running.pop(reference))
-            self._send_waiting()
+                if reference in self._starting:
+                    self._is_up(reference)
+                elif reference in self._running:  # else a call's other attempt has ended before, in this very loop
+                    self._end(reference, self._running.pop(reference))
+        self._send_waiting()
+        self._watch()
+
+    def retry(self, call: Call) -> None:
+        """Have a call made again that was suspected to end its actors."""
+        call.deaths = 0
+        self._queue(call)
+        self._send_waiting()
+
+    def drop(self) -> None:
+        """Forget all calls; what is under way comes to its end unheeded."""
+        for call in set(self._running.values()):
+            self._let_spare_go(call)
+        self._waiting, self._running = [], {}
+        for worker in self._workers:
+            worker.calls = []
 
     def close(self) -> None:
         """Stop the actors."""
-        for actor in self._actors:
-            ray.kill(actor)
-        self._actors = []
+        self.drop()
+        for worker in self._workers:
+            ray.kill(worker.actor)
+        self._workers, self._starting = [], {}
 
-    def _settle(self, awaited: Iterable[ray.ObjectRef]) -> None:
-        """Wait until one of these has ended, and take note of all that have."""
-        ray.wait(list(awaited), fetch_local=False)
-        self.take_note()
+    # Actors
+
+    def _start(self, number: int) -> Worker:
+        worker = Worker(number, self._make())
+        self._starting[worker.actor.__ray_ready__.remote()] = worker
+        return worker
+
+    def _is_up(self, reference: ray.ObjectRef) -> None:
+        worker = self._starting.pop(reference)
+        try:
+            ray.get(reference)
+        except RayActorError as error:
+            self._failed_starts += 1
+            if self._failed_starts == DEATHS_ALLOWED:
+                raise RunError(f"workers: {DEATHS_ALLOWED} ended while they started; {_last_line(error)}") from error
+            if worker in self._workers:
+                self._workers[worker.number] = self._start(worker.number)
+            for call in self._running.values():
+                if call.spare is worker:
+                    call.spare, call.began = None, None
+        else:
+            self._failed_starts, worker.up = 0, True
+
+    def _replace(self, worker: Worker) -> None:
+        """End an actor that is dead, slow or out of reach; its calls are queued again, and another takes its place."""
+        ray.kill(worker.actor)
+        self.restarts += 1
+        heir = next((call.spare for call in worker.calls if call.spare is not None), None) or self._start(-1)
+        heir.number = worker.number
+        self._workers[worker.number] = heir
+        for call in worker.calls:
+            self._running.pop(call.references[0], None)
+            if call.twin:
+                call.worker, call.references, call.began = heir, call.twin, None
+                heir.calls.append(call)
+            else:
+                self._queue(call)
+            call.spare, call.twin = None, []
+        worker.calls = []
+
+    # Calls
+
+    def _queue(self, call: Call) -> None:
+        call.worker, call.references, call.began = None, [], None
+        bisect.insort(self._waiting, call, key=lambda waiting: waiting.number)
 
     def _send_waiting(self) -> None:
-        while self._waiting and self._waiting[0].can_begin:
-            call = self._waiting[0]
-            if call.beside is not None:
-                call.worker = call.beside.worker
-            elif call.actor is None:
-                worker = min(range(len(self._actors)), key=self._held.__getitem__)
-                if self._held[worker] == self._ahead:
-                    return
-                call.worker = worker
-                self._held[worker] += 1
-            self._send(self._waiting.popleft())
+        for call in list(self._waiting):
+            if not all(part.references for part in call.built_upon):
+                continue
+            if call.on is None:
+                call.worker = self._choose(call)
+                if call.worker is None:
+                    continue
+                call.worker.calls.append(call)
+            self._waiting.remove(call)
+            call.references = self._send(call, call.on if call.worker is None else call.worker.actor)
 
-    def _send(self, call: Call) -> None:
-        if call.worker is not None:
-            call.actor = self._actors[call.worker]
-        references = (
-            getattr(call.actor, call.method).options(num_returns=call.returns).remote(*map(_now, call.arguments))
-        )
-        call.references = [references] if call.returns == 1 else references
-        self._running[call.references[0]] = call
+    def _choose(self, call: Call) -> Worker | None:
+        """Return the actor for a call, if one has room."""
+        if call.beside is not None and call.beside.worker in self._workers and call.beside.worker.up:
+            return call.beside.worker
+        worker = min((worker for worker in self._workers if worker.up), key=lambda one: one.load, default=None)
+        return worker if worker is not None and (worker.load < self._ahead or call.beside is not None) else None
 
-    def _end(self, call: Call) -> None:
+    def _send(self, call: Call, actor: Any) -> list[ray.ObjectRef]:
+        made = getattr(actor, call.method).options(num_returns=call.returns).remote(*map(_now, call.arguments))
+        references = [made] if call.returns == 1 else made
+        self._running[references[0]] = call
+        return references
+
+    def _settle(self, awaited: Iterable[ray.ObjectRef]) -> None:
+        """Wait until one of these has ended or an actor is up, or for a while, and take note of all that has."""
+        if references := [*awaited, *self._starting]:
+            ray.wait(references, fetch_local=False, timeout=WATCH_SECONDS)
+        self.take_note()
+        if any(worker.up for worker in self._workers):
+            self._manned = time.monotonic()
+        elif time.monotonic() - self._manned > PLACEMENT_SECONDS:
+            raise _no_room(len(self._workers))
+
+    def _end(self, reference: ray.ObjectRef, call: Call) -> None:
+        of_twin = bool(call.twin) and reference == call.twin[0]
         try:
-            call.value = ray.get(call.references[0])
-        except (ActorDiedError, ActorUnavailableError) as error:
-            # The error of a call that it builds upon comes here too; that one was sent again before.
-            if error.actor_id in (None, call.actor._actor_id.hex()):
-                self._replace(call, error)
-            self._send(call)
+            value = ray.get(reference)
+        except RayError as error:
+            self._failed(call, error, of_twin=of_twin)
             return
-        if call.worker is not None and call.beside is None:
-            self._held[call.worker] -= 1
-        call.done = True
+        if of_twin and call.worker is not None:
+            self._say(f"{call.label}: the other worker was first; worker {call.worker.number} is replaced")
+            self._replace(call.worker)
+        self._let_spare_go(call)
+        if call.began is not None:
+            self._seconds[call.method].append(time.monotonic() - call.began)
+        self._take_from_worker(call)
+        call.value, call.done = value, True
         call.arguments, call.beside = (), None  # what it was built upon may go
 
-    def _replace(self, call: Call, error: Exception) -> None:
-        call.deaths += 1
-        if call.worker is None or call.deaths == DEATHS_ALLOWED:
-            raise error
-        if self._actors[call.worker] is call.actor:  # else another call that it held has found out before
-            ray.kill(call.actor)  # one that is only out of reach would keep its place
-            self._actors[call.worker] = self._make()
-            self.restarts += 1
+    def _failed(self, call: Call, error: RayError, *, of_twin: bool) -> None:
+        """See to a call that failed: by itself, with its actor, or with something that it is built upon."""
+        cause, actor = _root(error), call.spare if of_twin else call.worker
+        if isinstance(cause, RayActorError):
+            if cause.actor_id in (None, _id(call.on if actor is None else actor.actor)):
+                self._actor_died(call, actor, cause)
+            elif of_twin:
+                self._let_spare_go(call)
+            else:  # what it is built upon is queued again as well
+                self._take_from_worker(call)
+                self._queue(call)
+            return
+        self._take_from_worker(call)
+        if isinstance(cause, ObjectLostError):
+            if any(call.built_upon):
+                raise LostError(f"{call.label}: what it builds upon is lost with the node it was on") from error
+            self._queue(call)
+            return
+        raise cause from error
+
+    def _take_from_worker(self, call: Call) -> None:
+        if call.worker is not None and call in call.worker.calls:
+            call.worker.calls.remove(call)
+
+    def _actor_died(self, call: Call, worker: Worker | None, error: RayActorError) -> None:
+        if worker is None:
+            raise LostError(f"{call.label}: the process that was to do it ended") from error
+        if worker is call.spare:
+            suspect = call
+            self._let_spare_go(call)
+        else:
+            suspect = worker.calls[0]
+            self._say(f"worker {worker.number} ended in the course of {suspect.label}; its work is done again")
+            self._replace(worker)
+        suspect.deaths += 1
+        if suspect.deaths >= DEATHS_ALLOWED and suspect in self._waiting:
+            self._waiting.remove(suspect)
+            raise DeadlyCallError(suspect) from error
+
+    # Slowness
+
+    def _watch(self) -> None:
+        """Start the clock of each call that is at work, and give those to a spare actor that take too long."""
+        now = time.monotonic()
+        own = [call for call in self._running.values() if call.on is not None]
+        first = [worker.calls[0] for worker in self._workers if worker.up and worker.calls]
+        for call in (*first, *own):
+            if call.began is None and all(part.done for part in call.built_upon):
+                call.began = now
+            elif call.began is not None and call.spare is None and now - call.began > self._patience(call):
+                self._rescue(call, now - call.began)
+            elif call.spare is not None and not call.twin and call.spare.up:
+                call.twin = self._send(call, call.spare.actor)
+
+    def _patience(self, call: Call) -> float:
+        known, least = self._seconds[call.method], LEAST_SECONDS if call.on is None else OWN_SECONDS
+        return max(least, SLOWNESS * median(known)) if len(known) >= PEERS else FIRST_SECONDS
+
+    def _rescue(self, call: Call, seconds: float) -> None:
+        if call.on is not None:
+            self._say(f"{call.label}: no answer for {seconds:.1f} s; its actor is ended")
+            ray.kill(call.on)
+            call.began = None
+            return
+        number = None if call.worker is None else call.worker.number
+        self._say(
+            f"worker {number} is slow: {call.label} has taken {seconds:.1f} s, over {SLOWNESS} times what "
+            "its like take; it is also given to another"
+        )
+        call.spare = self._start(-1)
+
+    def _let_spare_go(self, call: Call) -> None:
+        if call.spare is not None:
+            ray.kill(call.spare.actor)
+            for reference in call.twin[:1]:
+                self._running.pop(reference, None)
+            call.spare, call.twin, call.began = None, [], None
 
 
 def _now(given: Any) -> Any:
@@ -207,3 +422,26 @@ def _now(given: Any) -> Any:
     if isinstance(given, Call):
         return given.references[-1]
     return [_now(part) for part in given] if isinstance(given, list) else given
+
+
+def _id(actor: Any) -> str:
+    return actor._actor_id.hex()
+
+
+def _root(error: BaseException) -> BaseException:
+    """Return what went wrong at first: each call built upon another adds a layer."""
+    while isinstance(error, RayTaskError):
+        error = error.cause
+    return error
+
+
+def _last_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()
+
+
+def _no_room(size: int) -> NoRoomError:
+    return NoRoomError(
+        f"workers: got {size}, not all placed after {PLACEMENT_SECONDS} s; the cluster has "
+        f"{ray.cluster_resources().get('CPU', 0):.0f} CPUs, {ray.available_resources().get('CPU', 0):.0f} "
+        "free; ask for fewer or wait for other jobs to end"
+    )

@@ -1,6 +1,7 @@
 """The actor that runs experts and adapted policies in the simulator."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -8,13 +9,14 @@ from jaxtyping import Float32
 
 from dmil_core.configs import DemonstrationConfig, EvaluationConfig
 from dmil_core.demonstrations import Demonstration
+from dmil_core.errors import piece_of_work
 from dmil_core.methods.base import Method
 from dmil_core.networks import unflatten
 from dmil_core.seeding import stream_seed
 from services.rollouts import Trial, TrialOutcome, demonstrate, try_out
 from services.suites.base import Attempt, Environment, TaskSuite
 
-__all__ = ["SimulationWorker"]
+__all__ = ["SimulationWorker", "piece_of_call"]
 
 
 ENVIRONMENTS_KEPT = 40
@@ -41,20 +43,21 @@ class SimulationWorker:
         return envs
 
     def attempts(self, task: str, numbers: Sequence[int], config: DemonstrationConfig) -> list[Attempt]:
-        """Let the expert try, once for each of `numbers`, which name the attempts."""
+        """Let the expert try, once for each of `numbers`, which name the attempts.
+
+        Raises:
+            WorkError: for a Python error in one of them.
+        """
         (env, *_), expert = self._environments(task, 1), self._suite.expert(task)
         assert expert is not None
-        return [
-            demonstrate(
-                expert,
-                env,
-                stream_seed(config.seed, "demonstration", task, number),
-                self._suite.horizon,
-                config.noise,
-                config.trailing_steps,
-            )
-            for number in numbers
-        ]
+        attempts = []
+        for number in numbers:
+            seed = stream_seed(config.seed, "demonstration", task, number)
+            with piece_of_work(f"task {task}, attempt {number}, seed {seed}", task=task, attempt=number):
+                attempts.append(
+                    demonstrate(expert, env, seed, self._suite.horizon, config.noise, config.trailing_steps)
+                )
+        return attempts
 
     def try_out(
         self,
@@ -66,7 +69,21 @@ class SimulationWorker:
         evaluation: EvaluationConfig,
         seed: int,
     ) -> TrialOutcome:
-        """Adapt and roll out one trial."""
-        envs = self._environments(trial.task, len(trial.episodes))
-        own = unflatten(torch.tensor(parameters), shapes)
-        return try_out(method, own, trial, held_out, envs, self._suite.horizon, evaluation, seed)
+        """Adapt and roll out one trial.
+
+        Raises:
+            WorkError: for a Python error in it.
+        """
+        with piece_of_work(f"{trial.in_words}, seed {seed}", **trial.piece):
+            envs = self._environments(trial.task, len(trial.episodes))
+            own = unflatten(torch.tensor(parameters), shapes)
+            return try_out(method, own, trial, held_out, envs, self._suite.horizon, evaluation, seed)
+
+
+def piece_of_call(method: str, arguments: Sequence[Any]) -> tuple[str, dict[str, str | int]]:
+    """Return what names a call of a worker's method: in words, and as the piece of work that `WorkError` tells of."""
+    if method == "attempts":
+        task, numbers, _ = arguments
+        return f"task {task}, attempts {numbers[0]} to {numbers[-1]}", {"task": task, "attempt": numbers[0]}
+    trial: Trial = arguments[3]
+    return trial.in_words, trial.piece

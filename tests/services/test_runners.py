@@ -102,14 +102,18 @@ def test_any_number_of_workers_ends_with_the_same_bits(config, store: DemoStore,
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("joined")
-def test_neither_the_fan_in_nor_the_blocks_change_a_bit(config, store: DemoStore, data):
+def test_neither_the_fan_in_nor_the_blocks_change_a_bit(
+    config, store: DemoStore, data, monkeypatch: pytest.MonkeyPatch
+):
     experiment = Experiment(training(config, 11, 1), store)
     wanted = alone(experiment, data)
     all_groups = groups(experiment.config.training)
     with open_runner("ray", experiment.suite, 2):
         for fan_in, size in ((2, 1), (4, 1), (2, 2), (8, 4)):
+            monkeypatch.setattr(
+                RayMetaTraining, "blocks", [all_groups[part] for part in cut(len(all_groups), size)], raising=True
+            )
             meta_training = RayMetaTraining(plan_of(experiment, data), 2, fan_in)
-            meta_training.blocks = [all_groups[part] for part in cut(len(all_groups), size)]
             assert_same_bits(follow(meta_training), wanted)
             meta_training.close()
 
@@ -171,7 +175,7 @@ def test_a_killed_worker_changes_nothing(
     def kill(done: int) -> None:
         if where == "between two iterations" and done == 2:
             assert isinstance(meta_training, RayMetaTraining)
-            meta_training._pool._actors[0].__ray_call__.remote(lambda worker: worker._die_once())
+            meta_training._pool._workers[0].actor.__ray_call__.remote(lambda worker: worker._die_once())
 
     monkeypatch.setattr("services.ray_runner.AdaptationWorker", Mortal)
     with open_runner("ray", experiment.suite, 2) as runner:
