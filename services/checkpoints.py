@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +102,8 @@ class Checkpoints:
         """Keep the newest `kept` checkpoints, and the best besides."""
         self.folder = folder
         self.kept = kept
+        self.spares: Callable[[int], bool] = lambda iteration: False
+        """Tells by its iteration whether a checkpoint is still needed, and so not let go."""
 
     def all(self) -> list[Path]:
         """Return the checkpoints' folders, oldest first."""
@@ -162,7 +164,7 @@ class Checkpoints:
     def _let_go(self) -> None:
         keep = {*self.all()[-self.kept :], self.best()}
         for path in self.all():
-            if path not in keep:
+            if path not in keep and not self.spares(int(path.name.partition("-")[2])):
                 shutil.rmtree(path)
 
 

@@ -1,6 +1,7 @@
 """Evaluations of checkpoints: who is tried out on what, the rows that come of it, and those made on the way."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,9 @@ import torch
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.dmil import Dmil
-from services.checkpoints import Checkpoint
+from services.checkpoints import Checkpoint, Checkpoints
 from services.demo_store import TaskDemonstrations
+from services.failures import keeping_failures
 from services.progress import console
 from services.provenance import library_versions
 from services.results import AdaptationResult, EpisodeResult, Split, write_rows
@@ -46,16 +48,21 @@ class Evaluator:
             data: every task's demonstrations.
             held_out: of each task, those that support sets are drawn from.
         """
-        self._runner, self._config, self._suite, self._data, self._held_out = runner, config, suite, data, held_out
+        self._runner, self.config, self._suite, self._data, self._held_out = runner, config, suite, data, held_out
         self.trials = trials(tasks, config.evaluation)
         self._shared = {task: runner.share(demonstrations) for task, demonstrations in held_out.items()}
+
+    def is_due(self, iteration: int) -> bool:
+        """Tell whether a checkpoint is evaluated on the way."""
+        every = self.config.evaluation.every
+        return every is not None and 0 < iteration < self.config.training.iterations and iteration % every == 0
 
     def calls(self, checkpoint: Checkpoint) -> list[tuple[Any, ...]]:
         """Return the arguments of `SimulationWorker.try_out` for each trial; the checkpoint is not read again."""
         method = self._method(checkpoint)
         shapes = {name: torch.Size(shape) for name, shape in checkpoint.manifest.shapes.items()}
         parameters = self._runner.share(checkpoint.state.parameters)
-        config = self._config
+        config = self.config
         return [
             (method, parameters, shapes, trial, self._shared[trial.task], config.evaluation, config.seed)
             for trial in self.trials
@@ -63,8 +70,8 @@ class Evaluator:
 
     def evaluation(self, checkpoint: Checkpoint, outcomes: Iterable[TrialOutcome]) -> Evaluation:
         """Return a row for each episode and each adaptation, from the outcomes of the trials in their order."""
-        settings = self._config.evaluation
-        common = {"suite": self._suite.name, "protocol": self._suite.protocol, "method": self._config.method.name}
+        settings = self.config.evaluation
+        common = {"suite": self._suite.name, "protocol": self._suite.protocol, "method": self.config.method.name}
         common |= {"checkpoint": checkpoint.digest, "versions": library_versions()}
         common |= {"fine_tuning_steps": settings.fine_tuning_steps, "learning_rate": settings.learning_rate}
         episodes, adaptations = [], []
@@ -78,12 +85,12 @@ class Evaluator:
                 "data": self._data[trial.task].digest,
             }
             episodes += _episode_rows(row, trial, outcome)
-            adaptations.append(_adaptation_row(row, outcome, self._config.method.sub_skills))
+            adaptations.append(_adaptation_row(row, outcome, self.config.method.sub_skills))
         failed = {task: dataset.failed for task, dataset in self._data.items()}
         return Evaluation(checkpoint, self._suite.protocol, failed, episodes, adaptations)
 
     def _method(self, checkpoint: Checkpoint) -> Dmil:
-        return Dmil.restored(self._config.method, self._suite.action_dim, checkpoint.constants)
+        return Dmil.restored(self.config.method, self._suite.action_dim, checkpoint.constants)
 
 
 class Evaluations:
@@ -92,29 +99,52 @@ class Evaluations:
     Beside it, one is under way at a time; where the next begins before its end, meta-training waits for it.
     """
 
-    def __init__(self, runner: Runner, evaluator: Evaluator, folder: Path, tracker: Tracker, *, overlap: bool) -> None:
+    def __init__(
+        self, runner: Runner, evaluator: Evaluator, checkpoints: Checkpoints, tracker: Tracker, *, overlap: bool
+    ) -> None:
         """Evaluate nothing yet.
 
         Args:
             runner: does the work.
             evaluator: of the experiment.
-            folder: gets a folder for each evaluation, named by the iteration.
+            checkpoints: of the run; those that wait for their evaluation are not let go. The folder ``evaluations``
+                beside theirs gets a folder for each evaluation, named by the iteration.
             tracker: takes the success rates.
             overlap: evaluate beside meta-training.
         """
-        self._runner, self._evaluator, self._folder, self._tracker = runner, evaluator, folder, tracker
+        self._runner, self._evaluator, self._checkpoints, self._tracker = runner, evaluator, checkpoints, tracker
+        self._folder = checkpoints.folder.with_name("evaluations")
         self._overlap = overlap
+        checkpoints.spares = lambda iteration: self.is_due(iteration) and not self._is_made(iteration)
         self._under_way: tuple[Checkpoint, Simulation] | None = None
 
+    def is_due(self, iteration: int) -> bool:
+        """Tell whether the checkpoint of an iteration is evaluated on the way; the last one is when all is over."""
+        return self._evaluator.is_due(iteration)
+
+    def _is_made(self, iteration: int) -> bool:
+        return (self._folder / f"{iteration:07d}" / "episodes.jsonl").exists()
+
+    def make_up(self) -> None:
+        """Evaluate the checkpoints whose evaluation was due and dropped when the run was stopped."""
+        for path in self._checkpoints.all():
+            iteration = int(path.name.partition("-")[2])
+            if self.is_due(iteration) and not self._is_made(iteration):
+                self.begin(Checkpoint(path))
+
     def begin(self, checkpoint: Checkpoint) -> None:
-        """Evaluate a checkpoint, which may be deleted meanwhile."""
+        """Evaluate a checkpoint."""
         self.finish()
         calls = self._evaluator.calls(checkpoint)
-        if self._overlap:
-            self._under_way = checkpoint, self._runner.simulate_beside("try_out", calls)
-        else:
-            outcomes = dict(self._runner.simulate("try_out", calls))
-            self._record(checkpoint, [outcomes[index] for index in range(len(calls))])
+        with self._keeping_failures(checkpoint):
+            if self._overlap:
+                self._under_way = checkpoint, self._runner.simulate_beside("try_out", calls)
+            else:
+                outcomes = dict(self._runner.simulate("try_out", calls))
+                self._record(checkpoint, [outcomes[index] for index in range(len(calls))])
+
+    def _keeping_failures(self, checkpoint: Checkpoint) -> AbstractContextManager[None]:
+        return keeping_failures(self._folder.parent, self._evaluator.config, lambda: checkpoint.path)
 
     def look(self) -> None:
         """Record the evaluation under way, if it has come to its end."""
@@ -125,7 +155,8 @@ class Evaluations:
         """Wait for the evaluation under way, if there is one."""
         if self._under_way is not None:
             checkpoint, simulation = self._under_way
-            self._record(checkpoint, simulation.results())
+            with self._keeping_failures(checkpoint):
+                self._record(checkpoint, simulation.results())
             self._under_way = None
 
     def _record(self, checkpoint: Checkpoint, outcomes: Sequence[TrialOutcome]) -> None:

@@ -10,7 +10,7 @@ import torch
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError, Standardisation
-from dmil_core.errors import UserError
+from dmil_core.errors import RunError, UserError
 from dmil_core.methods.dmil import Dmil
 from dmil_core.networks import Parameters, flatten, unflatten
 from dmil_core.outer_loop import OuterState
@@ -19,7 +19,8 @@ from dmil_core.statistics import share_entropy
 from services.checkpoints import Checkpoint, CheckpointError, Checkpoints, Manifest
 from services.demo_store import DemoStore, TaskDemonstrations
 from services.evaluation import Evaluations, Evaluator, write_evaluation
-from services.progress import Bar
+from services.failures import keeping_failures
+from services.progress import Bar, console
 from services.provenance import library_versions
 from services.ray_runner import RayRunner
 from services.results import Split
@@ -27,12 +28,23 @@ from services.rollouts import TrialOutcome
 from services.runners import Iteration, LocalRunner, Plan, Runner
 from services.suites.base import Attempt, TaskSuite
 from services.suites.metaworld import MetaWorldSuite
-from services.summary import Evaluation
+from services.summary import AGAINST_COLLAPSE, COLLAPSED, Evaluation
 from services.tracking import Tracker
 
-__all__ = ["Experiment", "NoWorkersError", "RunnerKind", "open_runner"]
+__all__ = [
+    "CollapseWatch",
+    "Experiment",
+    "NoWorkersError",
+    "NonFiniteError",
+    "OnNonfinite",
+    "RunnerKind",
+    "open_runner",
+]
 
 RunnerKind = Literal["ray", "local"]
+OnNonfinite = Literal["stop", "skip"]
+COLLAPSED_ITERATIONS = 100
+"""So long may one sub-skill take nearly all states before a warning."""
 CHUNK = 10
 """Attempts of an expert in one call to a simulation worker."""
 PATIENCE = 10
@@ -57,6 +69,38 @@ def open_runner(kind: RunnerKind, suite: TaskSuite, workers: int | None) -> Iter
         yield runner
     finally:
         runner.close()
+
+
+class NonFiniteError(RunError):
+    """A loss or a gradient that is not finite."""
+
+    def __init__(self, told: str, folder: Path) -> None:
+        """Say what is to be done about it."""
+        super().__init__(
+            f"{told}; the step is not taken, the state before it is checkpointed; look at these demonstrations, or go "
+            f"on without such steps: python -m services.meta_train --resume {folder} --on-nonfinite skip"
+        )
+
+
+class CollapseWatch:
+    """Notices that one sub-skill takes nearly all states for long, and says so once."""
+
+    def __init__(self) -> None:
+        """Nothing is noticed yet."""
+        self._iterations, self._told = 0, False
+
+    def look(self, iteration: int, metrics: Mapping[str, float]) -> str | None:
+        """Return the warning, when it is due after an iteration with these metrics."""
+        shares = _shares(metrics)
+        collapsed = len(shares) > 1 and shares.max() > COLLAPSED
+        self._iterations = self._iterations + 1 if collapsed else 0
+        if self._told or self._iterations < COLLAPSED_ITERATIONS:
+            return None
+        self._told = True
+        return (
+            f"sub-skill {shares.argmax()} has taken over {COLLAPSED:.0%} of the states for {COLLAPSED_ITERATIONS} "
+            f"iterations, up to {iteration}: the hierarchy is not used; {AGAINST_COLLAPSE}"
+        )
 
 
 class Experiment:
@@ -130,9 +174,10 @@ class Experiment:
                         numbers = range(start, min(start + CHUNK, first + lacking(task)))
                         calls.append((task, numbers, settings))
                 results: dict[int, list[Attempt]] = {}
-                for index, made in runner.simulate("attempts", calls):
-                    results[index] = made
-                    bar.advance(sum(attempt.solved_at is not None for attempt in made), calls[index][0])
+                with keeping_failures(self.store.root, self.config):
+                    for index, made in runner.simulate("attempts", calls):
+                        results[index] = made
+                        bar.advance(sum(attempt.solved_at is not None for attempt in made), calls[index][0])
                 for index, call in enumerate(calls):
                     attempts[call[0]] += results[index]
         return attempts
@@ -171,10 +216,12 @@ class Experiment:
         resume: Checkpoint | None = None,
         *,
         overlap_evaluation: bool = True,
+        on_nonfinite: OnNonfinite = "stop",
     ) -> Checkpoint:
         """Meta-train to the set number of iterations and return the last checkpoint.
 
-        Stopped by Ctrl-C or SIGTERM, it writes a checkpoint first, and drops an evaluation that is under way.
+        Stopped by Ctrl-C, SIGTERM or a fault, it writes a checkpoint first, and drops an evaluation that is under way;
+        who resumes makes that up.
 
         Args:
             runner: does the work.
@@ -183,9 +230,12 @@ class Experiment:
             tracker: takes the metrics of each iteration.
             resume: go on from here.
             overlap_evaluation: go on with meta-training during evaluations on the way.
+            on_nonfinite: what to do where a loss or a gradient is not finite: stop, or count the iteration as done
+                without its step.
 
         Raises:
             CheckpointError: if the checkpoint to go on from was trained on other demonstrations.
+            RunError: where numbers are not finite, or for an error in a slot, which is named.
         """
         settings = self.config.training
         sets = self.training_sets(data)
@@ -195,8 +245,6 @@ class Experiment:
         digests = {task: dataset.digest for task, dataset in data.items()}
         _same_data(resume, digests, self.store)
         state = OuterState.start(flatten(initial).numpy()) if resume is None else resume.state
-        if state.iteration >= settings.iterations and resume is not None:
-            return resume
 
         def save(state: OuterState, loss: float | None) -> Path:
             parameters = unflatten(torch.tensor(state.parameters), shapes)
@@ -215,35 +263,59 @@ class Experiment:
         evaluations = Evaluations(
             runner,
             self.evaluator(runner, data),
-            checkpoints.folder.with_name("evaluations"),
+            checkpoints,
             tracker,
             overlap=overlap_evaluation,
         )
-        training = runner.meta_train(Plan(method, shapes, sets, state, settings, self.config.seed))
+        evaluations.make_up()
+        if state.iteration >= settings.iterations and resume is not None:
+            evaluations.finish()
+            return resume
+        plan = Plan(method, shapes, sets, state, settings, self.config.seed, skip_nonfinite=on_nonfinite == "skip")
+        training = runner.meta_train(plan)
+        collapse = CollapseWatch()
         losses: list[float] = []
         path, saved = None, -1
+
+        def save_now() -> Path | None:
+            state = training.state()
+            if state.iteration == saved:
+                return path
+            return save(state, float(np.mean(losses)) if losses else None)
+
         try:
-            with Bar("meta-training", settings.iterations, state.iteration) as bar:
+            with (
+                Bar("meta-training", settings.iterations, state.iteration) as bar,
+                keeping_failures(checkpoints.folder.parent, self.config, save_now),
+            ):
                 for iteration in training.iterations(settings.iterations - state.iteration):
                     done = iteration.number
                     metrics = _iteration_metrics(iteration)
+                    if not iteration.stepped:
+                        told = _nonfinite_in_words(iteration)
+                        if on_nonfinite == "stop":
+                            save_now()
+                            raise NonFiniteError(told, checkpoints.folder.parent)
+                        console.print(f"warning: {told}; the step is not taken")
+                        metrics = {name: value for name, value in metrics.items() if np.isfinite(value)}
+                    else:
+                        losses.append(metrics["high_loss_after"] + metrics["low_loss_after"])
                     tracker.metrics(done, metrics)
-                    losses.append(metrics["high_loss_after"] + metrics["low_loss_after"])
                     bar.advance(1, _in_words(metrics))
+                    if warning := collapse.look(done, metrics):
+                        console.print(f"warning: {warning}")
+                        tracker.tags({"warning.collapse": warning})
                     evaluations.look()
                     last = done == settings.iterations
                     if done % settings.checkpoint_every == 0 or last:
-                        path, saved = save(training.state(), float(np.mean(losses))), done
+                        path, saved = save(training.state(), float(np.mean(losses)) if losses else None), done
                         losses.clear()
-                        # The last checkpoint is evaluated by all workers when meta-training is over.
-                        if self.config.evaluation.every and done % self.config.evaluation.every == 0 and not last:
+                        if evaluations.is_due(done):
                             evaluations.begin(Checkpoint(path))
                 evaluations.finish()
             return Checkpoint(path or save(training.state(), None))
         except KeyboardInterrupt:
-            state = training.state()
-            if state.iteration != saved:
-                save(state, float(np.mean(losses)) if losses else None)
+            save_now()
             raise
         finally:
             training.close()
@@ -260,7 +332,8 @@ class Experiment:
         evaluator = self.evaluator(runner, data)
         outcomes: dict[int, TrialOutcome] = {}
         successes = 0
-        with Bar("evaluating", sum(len(trial.episodes) for trial in evaluator.trials)) as bar:
+        episodes = sum(len(trial.episodes) for trial in evaluator.trials)
+        with Bar("evaluating", episodes) as bar, keeping_failures(folder, self.config, lambda: checkpoint.path):
             for index, outcome in runner.simulate("try_out", evaluator.calls(checkpoint)):
                 outcomes[index] = outcome
                 successes += sum(episode.success for episode in outcome.episodes)
@@ -287,6 +360,14 @@ def _same_data(resume: Checkpoint | None, digests: Mapping[str, str], store: Dem
             f"{resume.path}: trained on other demonstrations of {', '.join(changed)} than the store {store.root} "
             "holds; point DMIL_DATA to those it was trained on"
         )
+
+
+def _nonfinite_in_words(iteration: Iteration) -> str:
+    slots = "; ".join(
+        f"slot {slot.slot}, task {slot.task}, demonstrations {', '.join(dict.fromkeys(slot.demonstrations))}"
+        for slot in iteration.spoilt
+    )
+    return f"iteration {iteration.number}: a loss or a gradient is not finite in {slots or 'the sum over all slots'}"
 
 
 def _iteration_metrics(iteration: Iteration) -> dict[str, float]:

@@ -17,7 +17,7 @@ from dmil_core.configs import ExperimentConfig
 from services.checkpoints import Checkpoint, CheckpointError, Checkpoints
 from services.command_line import DEFAULT_PRESET, ConfigError, config_from, exit_code, explain, parse, peek
 from services.demo_store import DemoStore, data_root
-from services.experiment import Experiment, RunnerKind, open_runner
+from services.experiment import Experiment, OnNonfinite, RunnerKind, open_runner
 from services.progress import Clock, console
 from services.report import publish, show, write_report
 from services.summary import summarise
@@ -44,6 +44,8 @@ class Arguments:
     """Ray workers of each kind, one for each CPU of the cluster if not given; they do not change the result."""
     overlap_evaluation: bool = True
     """Go on with meta-training during the evaluations that --evaluation.every asks for; the results are the same."""
+    on_nonfinite: OnNonfinite = "stop"
+    """Where a loss or a gradient is not finite: stop, or go on without that step."""
     runs: Path = Path("runs")
     """The folder that the run's own folder is made in."""
     name: str | None = None
@@ -72,7 +74,13 @@ def run(arguments: Sequence[str]) -> None:
             tracker.inputs({dataset.id: dataset.digest for dataset in data.values()})
             clock.lap("collect")
             trained = experiment.train(
-                runner, data, checkpoints, tracker, checkpoint, overlap_evaluation=given.overlap_evaluation
+                runner,
+                data,
+                checkpoints,
+                tracker,
+                checkpoint,
+                overlap_evaluation=given.overlap_evaluation,
+                on_nonfinite=given.on_nonfinite,
             )
             clock.lap("train")
             evaluation = experiment.evaluate(runner, data, trained, folder)

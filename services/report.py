@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 
 from services.checkpoints import Checkpoint
 from services.progress import console
-from services.summary import Summary, rates, table, table_markdown, write_summary
+from services.summary import AGAINST_COLLAPSE, COLLAPSED, Summary, rates, table, table_markdown, write_summary
 from services.tracking import Tracker
 
 __all__ = ["draw_curves", "publish", "read_metrics", "show", "write_report"]
@@ -25,8 +25,6 @@ PANELS: Mapping[str, tuple[str, ...]] = {
     "agreement and usage entropy": ("agreement", "sub_skill_entropy"),
     "gradient norm": ("gradient_norm",),
 }
-COLLAPSED = 0.99
-"""A sub-skill with more of the states than this leaves nothing to the others."""
 SMOOTHED = 50
 """A curve is drawn through so many means at most."""
 
@@ -102,8 +100,7 @@ def show(summary: Summary, tracking_uri: str | None = None) -> None:
         )
     if any(len(use.share) > 1 and max(use.share) > COLLAPSED for use in summary.sub_skills.values()):
         console.print(
-            "warning: one sub-skill takes nearly all states, so the hierarchy is not used; another --seed, a smaller "
-            "--training.learning-rate or --method.continuity-weight may help"
+            f"warning: one sub-skill takes nearly all states, so the hierarchy is not used; {AGAINST_COLLAPSE}"
         )
     if failed := {task: count for task, count in summary.failed_attempts.items() if count}:
         console.print("failed expert attempts: " + ", ".join(f"{task} {count}" for task, count in failed.items()))

@@ -1,5 +1,6 @@
 """Where an experiment's work is done: here, or by the actors of `services.ray_runner`, with the same bits."""
 
+import math
 import signal
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -50,8 +51,13 @@ class Iteration(NamedTuple):
     spoilt: list[SpoiltSlot]
     """Those with a loss or a gradient that is not finite."""
     gradient_norm: float
-    """Before clipping; where it is not finite, no step was taken."""
+    """Before clipping."""
     timing: Timing
+
+    @property
+    def stepped(self) -> bool:
+        """Whether the outer step was taken: by a gradient that is not finite, none is."""
+        return math.isfinite(self.gradient_norm)
 
 
 class MetaTraining(Protocol):

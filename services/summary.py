@@ -15,6 +15,8 @@ from services.checkpoints import Checkpoint
 from services.results import AdaptationResult, EpisodeResult, Split
 
 __all__ = [
+    "AGAINST_COLLAPSE",
+    "COLLAPSED",
     "PAPER",
     "Cell",
     "Evaluation",
@@ -36,6 +38,12 @@ PAPER: dict[tuple[str, Split, int], float] = {
     ("ml10", "meta-testing", 3): 0.710,
 }
 """DMIL in Table 4, K = 3: by suite, split and shots."""
+COLLAPSED = 0.99
+"""A sub-skill with more of the states than this leaves nothing to the others."""
+AGAINST_COLLAPSE = (
+    "another --seed, a smaller --training.learning-rate or --method.output-scale may help, and "
+    "--method.continuity-weight 0"
+)
 
 
 class Evaluation(NamedTuple):

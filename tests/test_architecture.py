@@ -26,6 +26,7 @@ FLOORS = {
     "services.suites": 3,
     "services.demo_store": 3,
     "services.disk": 3,
+    "services.failures": 3,
     "services.checkpoints": 3,
     "services.tracking": 3,
     "services.progress": 3,

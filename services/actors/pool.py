@@ -60,6 +60,8 @@ class Call:
         self.done = False
         self.value: Any = None
         """Its first result, once it is done."""
+        self.error: BaseException | None = None
+        """What it ended with in the place of results; so do all that are built upon it."""
         self.deaths = 0
         self.spare: Worker | None = None
         """An actor that does the same, where its own is slow."""
@@ -172,10 +174,13 @@ class Pool:
             DeadlyCallError: if three actors end one after the other in the course of some call.
             LostError: if an actor of one's own is gone, or a result that a call is built upon.
             NoRoomError: if no actor is left, and none can be placed.
+            Exception: whatever the call raised.
         """
         while not call.done:
             # Those that wait want to be sent as soon as any call ends; else only this one matters.
             self._settle(self._running if self._waiting else [*call.references[:1], *call.twin[:1]])
+        if call.error is not None:
+            raise call.error
         return call.value
 
     def results(self, calls: Sequence[Call]) -> Iterator[tuple[int, Any]]:
@@ -187,7 +192,7 @@ class Pool:
         left = dict(enumerate(calls))
         while left:
             for index in [index for index, call in left.items() if call.done]:
-                yield index, left.pop(index).value
+                yield index, self.result(left.pop(index))
             if left:
                 self._settle(self._running)
 
@@ -350,13 +355,15 @@ class Pool:
                 self._take_from_worker(call)
                 self._queue(call)
             return
+        self._let_spare_go(call)
         self._take_from_worker(call)
-        if isinstance(cause, ObjectLostError):
-            if any(call.built_upon):
-                raise LostError(f"{call.label}: what it builds upon is lost with the node it was on") from error
+        if not isinstance(cause, ObjectLostError):
+            cause.__cause__ = error  # the traceback of the other process
+            call.error, call.done = cause, True
+        elif any(call.built_upon):
+            raise LostError(f"{call.label}: what it builds upon is lost with the node it was on") from error
+        else:
             self._queue(call)
-            return
-        raise cause from error
 
     def _take_from_worker(self, call: Call) -> None:
         if call.worker is not None and call in call.worker.calls:

@@ -2,17 +2,13 @@
 
 import os
 import signal
-from collections.abc import Callable, Mapping
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from dmil_core.configs import ExperimentConfig
-from dmil_core.networks import flatten
-from dmil_core.outer_loop import OuterState, groups
+from dmil_core.outer_loop import groups
 from services.actors.adaptation import AdaptationWorker
 from services.actors.freight import PIECE, pack, unpack
 from services.actors.learner import Learner
@@ -20,60 +16,9 @@ from services.demo_store import DemoStore
 from services.experiment import Experiment, open_runner
 from services.ray_runner import RayMetaTraining
 from services.results import EpisodeResult
-from services.runners import MetaTraining, Plan, Runner
+from services.runners import Runner
 from services.timing import Span, Timing
-
-ITERATIONS = 4
-
-
-def training(config: ExperimentConfig, slots: int, group: int) -> ExperimentConfig:
-    settings = {"iterations": ITERATIONS, "tasks_per_iteration": slots, "slots_per_group": group, "gradient_clip": 1.0}
-    return config.model_copy(update={"training": config.training.model_copy(update=settings)})
-
-
-def plan_of(experiment: Experiment, data) -> Plan:
-    config = experiment.config
-    sets = experiment.training_sets(data)
-    method = experiment.method(sets)
-    initial = experiment.initial_parameters(method)
-    shapes = {name: tensor.shape for name, tensor in initial.items()}
-    return Plan(method, shapes, sets, OuterState.start(flatten(initial).numpy()), config.training, config.seed)
-
-
-class Course(NamedTuple):
-    """What was to be seen of a meta-training from outside, iteration by iteration."""
-
-    numbers: list[int]
-    slots: list[list[Mapping[str, float]]]
-    norms: list[float]
-    states: list[OuterState]
-
-
-def follow(
-    training: MetaTraining, count: int = ITERATIONS, disturb: Callable[[int], None] = lambda done: None
-) -> Course:
-    """Do a few iterations, looking at the state after each."""
-    course = Course([], [], [], [])
-    for iteration in training.iterations(count):
-        course.numbers.append(iteration.number)
-        course.slots.append(iteration.slots)
-        course.norms.append(iteration.gradient_norm)
-        course.states.append(training.state())
-        disturb(iteration.number)
-    return course
-
-
-def alone(experiment: Experiment, data) -> Course:
-    """Do the same in this process."""
-    with open_runner("local", experiment.suite, None) as runner:
-        return follow(runner.meta_train(plan_of(experiment, data)))
-
-
-def assert_same_bits(one: Course, other: Course) -> None:
-    assert one[:3] == other[:3]
-    for state, wanted in zip(one.states, other.states, strict=True):
-        assert state.iteration == wanted.iteration
-        assert all(map(np.array_equal, state[1:], wanted[1:]))
+from tests.services.courses import ITERATIONS, Course, alone, assert_same_bits, follow, plan_of, training
 
 
 def cut(groups: int, size: int) -> list[slice]:

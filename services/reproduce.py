@@ -1,0 +1,83 @@
+"""Do the piece of work again in which a program failed: alone, in this process, with the whole traceback."""
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+
+from dmil_core.errors import RunError
+from dmil_core.networks import unflatten
+from dmil_core.outer_loop import group_gradient, tasks_of
+from services.actors.simulation import SimulationWorker
+from services.checkpoints import Checkpoint
+from services.command_line import exit_code, parse
+from services.demo_store import DemoStore, data_root
+from services.experiment import Experiment
+from services.failures import Failure, read_failure
+from services.progress import console
+from services.runners import LocalRunner
+
+__all__ = ["Arguments", "run"]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Arguments of ``reproduce``."""
+
+    failure: Annotated[Path, tyro.conf.Positional]
+    """The failure.json that the program named, or the folder it is in."""
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run the program."""
+    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
+    failure = read_failure(given.failure)
+    console.print(f"{failure.where}: it failed with\n{failure.problem}\nand is done again:")
+    experiment = Experiment(failure.config, DemoStore(data_root()))
+    work = _attempt if "attempt" in failure.piece else _slot if "slot" in failure.piece else _trial
+    work(failure, experiment)()
+    console.print("it comes to its end here: look for what differs, such as memory, versions or the machine")
+
+
+def _attempt(failure: Failure, experiment: Experiment) -> Callable[[], object]:
+    worker, piece = SimulationWorker(experiment.suite), failure.piece
+    return lambda: worker.attempts(str(piece["task"]), [int(piece["attempt"])], failure.config.demonstrations)
+
+
+def _slot(failure: Failure, experiment: Experiment) -> Callable[[], object]:
+    data = experiment.collect(LocalRunner(experiment.suite))
+    sets = experiment.training_sets(data)
+    method, checkpoint, config = experiment.method(sets), _checkpoint(failure), failure.config
+    shapes = {name: torch.Size(shape) for name, shape in checkpoint.manifest.shapes.items()}
+    parameters = unflatten(torch.from_numpy(checkpoint.state.parameters), shapes)
+    iteration = int(failure.piece["iteration"])
+    if checkpoint.manifest.iteration != iteration:
+        raise RunError(f"{checkpoint.path}: got iteration {checkpoint.manifest.iteration}; wanted {iteration}")
+    tasks = tasks_of(iteration, list(sets), config.seed, config.training.tasks_per_iteration)
+    slot = int(failure.piece["slot"])
+    return lambda: group_gradient(method, sets, parameters, config.seed, iteration, tasks, [slot])
+
+
+def _trial(failure: Failure, experiment: Experiment) -> Callable[[], object]:
+    runner = LocalRunner(experiment.suite)
+    evaluator = experiment.evaluator(runner, experiment.collect(runner))
+    (call,) = (
+        call
+        for trial, call in zip(evaluator.trials, evaluator.calls(_checkpoint(failure)), strict=True)
+        if trial.piece == failure.piece
+    )
+    return lambda: list(runner.simulate("try_out", [call]))
+
+
+def _checkpoint(failure: Failure) -> Checkpoint:
+    if failure.checkpoint is None:
+        raise RunError("the state it began from was not checkpointed; run the program again with the same settings")
+    return Checkpoint(Path(failure.checkpoint))
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(run, sys.argv[1:]))

@@ -1,0 +1,416 @@
+"""Whatever is killed, hangs or goes wrong in meta-training: the same bits come out, or what went wrong is named."""
+
+import json
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import ray
+from ray.cluster_utils import Cluster as Nodes
+
+from dmil_core.configs import ExperimentConfig
+from dmil_core.errors import WorkError
+from dmil_core.methods.dmil import Dmil
+from services import meta_train, reproduce
+from services.checkpoints import Checkpoints
+from services.command_line import exit_code
+from services.demo_store import DemoStore, TaskDemonstrations
+from services.disk import DiskFullError
+from services.experiment import CollapseWatch, Experiment, open_runner
+from services.failures import read_failure
+from services.ray_runner import RayMetaTraining
+from services.results import EpisodeResult, write_rows
+from services.suites.base import Attempt
+from tests.services.conftest import QUICK_EVALUATION
+from tests.services.courses import ITERATIONS, alone, assert_same_bits, follow, plan_of, training
+
+SLOTS = 5
+
+
+@pytest.fixture
+def small(config: ExperimentConfig, store: DemoStore) -> Experiment:
+    return Experiment(training(config, SLOTS, 1), store)
+
+
+def pid_of(actor) -> int:
+    return ray.get(actor.__ray_call__.remote(lambda worker: os.getpid()))
+
+
+# Killed and hung
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("joined")
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_lost_learner_changes_nothing(small: Experiment, data, how: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("services.actors.pool.OWN_SECONDS", 2.0)
+    wanted = alone(small, data)
+    with open_runner("ray", small.suite, 2) as runner:
+        meta_training = runner.meta_train(plan_of(small, data))
+        assert isinstance(meta_training, RayMetaTraining)
+
+        def strike(done: int) -> None:
+            if done in (1, 3):
+                os.kill(pid_of(meta_training._learner), how)
+
+        found = follow(meta_training, disturb=strike)
+    assert_same_bits(found, wanted)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("joined")
+def test_what_was_done_since_the_last_state_is_done_again(small: Experiment, data):
+    wanted = alone(small, data)
+    with open_runner("ray", small.suite, 2) as runner:
+        meta_training = runner.meta_train(plan_of(small, data))
+        assert isinstance(meta_training, RayMetaTraining)
+        numbers = []
+        for iteration in meta_training.iterations(ITERATIONS):
+            numbers.append(iteration.number)
+            assert iteration.slots == wanted.slots[iteration.number - 1]
+            if iteration.number == 3:
+                os.kill(pid_of(meta_training._learner), signal.SIGKILL)
+        state = meta_training.state()
+    assert numbers == list(range(1, ITERATIONS + 1))
+    assert all(map(np.array_equal, state[1:], wanted.states[-1][1:]))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("joined")
+def test_a_hung_worker_is_overtaken_and_the_log_says_so(
+    small: Experiment, data, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr("services.actors.pool.LEAST_SECONDS", 0.5)
+    wanted = alone(small, data)
+    with open_runner("ray", small.suite, 2) as runner:
+        meta_training = runner.meta_train(plan_of(small, data))
+        assert isinstance(meta_training, RayMetaTraining)
+
+        def strike(done: int) -> None:
+            if done in (2, 3):
+                os.kill(pid_of(meta_training._pool._workers[done % 2].actor), signal.SIGSTOP)
+
+        found = follow(meta_training, disturb=strike)
+    assert_same_bits(found, wanted)
+    printed = capsys.readouterr().out
+    assert "is slow: iteration " in printed
+    assert "also given to another" in printed
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("joined")
+def test_a_slot_that_ends_its_workers_is_named(small: Experiment, data):
+    class Deadly(Dmil):
+        def task_gradient(self, parameters, material):
+            if material.task == "push" and len(list(folder.iterdir())) >= 2:
+                os.kill(os.getpid(), signal.SIGSEGV)
+            if material.task == "push":
+                (folder / str(time.time())).touch()
+            return super().task_gradient(parameters, material)
+
+    plan = plan_of(small, data)
+    folder = small.store.root / "seen"
+    folder.mkdir()
+    method = plan.method
+    assert isinstance(method, Dmil)
+    deadly = plan._replace(method=Deadly(method.config, method.action_dim, method.standardise))
+    with open_runner("ray", small.suite, 2) as runner:
+        meta_training = runner.meta_train(deadly)
+        with pytest.raises(WorkError, match=r"iteration \d, slot \d, task push, seed 0: .*3 workers ended") as error:
+            follow(meta_training)
+        piece = error.value.piece
+        assert deadly.tasks(int(piece["iteration"]))[int(piece["slot"])] == "push"
+        assert meta_training.state().iteration == piece["iteration"]
+
+
+@pytest.fixture
+def nodes(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nodes]:
+    folder = Path("/tmp") / f"dmil-{os.getpid()}"  # Ray's sockets lie in it: a path of over 107 bytes is too long
+    (folder / "ray").mkdir(parents=True)
+    monkeypatch.setenv("RAY_TMPDIR", str(folder))
+    settings = {"object_store_memory": 100_000_000, "include_dashboard": False}
+    nodes = Nodes(initialize_head=True, head_node_args={"num_cpus": 2, **settings})
+    monkeypatch.setenv("RAY_ADDRESS", nodes.address)
+    yield nodes
+    nodes.shutdown()
+    subprocess.run(["rm", "-rf", str(folder)], check=True)
+
+
+@pytest.mark.slow
+def test_nodes_may_leave_and_join(config: ExperimentConfig, store: DemoStore, data, nodes: Nodes):
+    several = Experiment(training(config, 7, 1), store)
+    wanted = alone(several, data)
+    leaving = nodes.add_node(num_cpus=1, object_store_memory=100_000_000)
+    with open_runner("ray", several.suite, None) as runner:
+        assert runner.workers == 3
+        meta_training = runner.meta_train(plan_of(several, data))
+        assert isinstance(meta_training, RayMetaTraining)
+        up = [len(meta_training)]
+
+        def change(done: int) -> None:
+            if done == 1:
+                nodes.remove_node(leaving, allow_graceful=False)
+            if done == 2:
+                up.append(len(meta_training))
+                nodes.add_node(num_cpus=2, object_store_memory=100_000_000)
+                until = time.monotonic() + 60
+                while len(meta_training) < 4 and time.monotonic() < until:
+                    meta_training._pool.grow(runner.workers)
+                    meta_training._pool.take_note()
+                    time.sleep(0.2)
+                up.append(len(meta_training))
+
+        found = follow(meta_training, disturb=change)
+        assert runner.workers == 4
+    assert up == [3, 2, 4]
+    assert_same_bits(found, wanted)
+
+
+# Errors in the work
+
+
+class FailingDmil(Dmil):
+    """Fails at a task, from the third iteration on."""
+
+    calls = 0
+
+    def task_gradient(self, parameters, material):
+        FailingDmil.calls += 1
+        if FailingDmil.calls > 2 * 3 and material.task == "push":
+            raise ArithmeticError("out of numbers")
+        return super().task_gradient(parameters, material)
+
+
+def test_an_error_is_told_with_the_command_that_repeats_it(
+    train, workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr("services.experiment.Dmil", FailingDmil)
+    monkeypatch.setattr(FailingDmil, "calls", 0)
+    arguments = ["--preset", "ml10-smoke", "--runner", "local", "--name", "run"]
+    assert exit_code(meta_train.run, arguments) == 1
+    said = capsys.readouterr().err
+    assert "Traceback" not in said
+    assert "iteration 3, slot " in said
+    assert "task push, seed 0: ArithmeticError: out of numbers" in said
+    command = said.strip().splitlines()[-1].partition("python -m services.reproduce ")[2]
+    assert command == "runs/run/failure.json"
+    failure = read_failure(Path(command))
+    assert failure.piece["iteration"] == 2
+    assert "task_gradient" in failure.trace
+    assert failure.checkpoint is not None
+    assert failure.checkpoint.endswith("iteration-0000002")
+
+    with pytest.raises(WorkError, match="out of numbers"):
+        reproduce.run([command])
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("joined")
+def test_an_error_in_a_worker_arrives_whole(small: Experiment, data):
+    class Failing(Dmil):
+        def task_gradient(self, parameters, material):
+            if material.task == "push":
+                raise ArithmeticError("out of numbers")
+            return super().task_gradient(parameters, material)
+
+    plan = plan_of(small, data)
+    method = plan.method
+    assert isinstance(method, Dmil)
+    failing = plan._replace(method=Failing(method.config, method.action_dim, method.standardise))
+    with open_runner("ray", small.suite, 2) as runner:
+        meta_training = runner.meta_train(failing)
+        with pytest.raises(WorkError, match=r"iteration 1, slot .*, task push.*: ArithmeticError: out of n") as error:
+            follow(meta_training)
+        assert "in task_gradient" in error.value.trace
+        assert meta_training.state().iteration == 0
+
+
+def test_a_failing_expert_and_a_failing_trial_are_named(
+    train, workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    train("run", "--training.iterations", "1")
+    capsys.readouterr()
+    with monkeypatch.context() as patch:
+        patch.setattr("services.actors.simulation.try_out", lambda *given: 1 / 0)
+        assert exit_code(meta_train.run, ["--resume", "run", "--runner", "local"]) == 1
+        said = capsys.readouterr().err
+        assert "meta-training task reach, 1-shot, support set 0, seed 0: ZeroDivisionError: division by zero" in said
+        with pytest.raises(WorkError, match="division by zero"):
+            reproduce.run(["runs/run"])
+    reproduce.run(["runs/run/failure.json"])
+    assert "it comes to its end here" in capsys.readouterr().out
+
+    monkeypatch.setenv("DMIL_DATA", str(workplace / "data"))
+    with monkeypatch.context() as patch:
+        patch.setattr("services.actors.simulation.demonstrate", lambda *given: 1 / 0)
+        arguments = ["--preset", "ml10-smoke", "--runner", "local", "--name", "other"]
+        assert exit_code(meta_train.run, arguments) == 1
+    said = capsys.readouterr().err
+    assert "task reach, attempt 0, seed " in said
+    assert f"python -m services.reproduce {workplace / 'data' / 'failure.json'}" in said
+    reproduce.run([str(workplace / "data")])
+
+
+def test_no_failure_is_told_as_a_users_mistake(complaint, workplace: Path):
+    (workplace / "failure.json").write_text('{"where": 1}')
+    for given in ("nowhere", "failure.json"):
+        assert f"{given}: got" in complaint(reproduce.run, given).replace("/failure.json", "")
+
+
+# Numbers that go wrong
+
+
+@pytest.fixture
+def spoilt(data: dict[str, TaskDemonstrations], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> DemoStore:
+    """A store in which one demonstration of push has an action whose square is too large for a float."""
+    store = DemoStore(workplace / "spoilt")
+    for task, dataset in data.items():
+        attempts = []
+        for index, demonstration in enumerate(dataset.demonstrations):
+            actions = demonstration.actions.copy()
+            if task == "push" and index == 3:
+                actions[:] = 1e30
+            observations = np.concatenate([demonstration.observations, demonstration.observations[-1:]])
+            attempts.append(Attempt(index, [0.0], len(actions) - 1, observations, actions))
+        store.save(dataset.id, task, attempts, failed=0, settings={})
+    monkeypatch.setenv("DMIL_DATA", str(store.root))
+    return store
+
+
+@pytest.mark.usefixtures("spoilt")
+def test_numbers_that_are_not_finite_stop_a_run_before_the_step(train, capsys: pytest.CaptureFixture[str]):
+    arguments = ["--preset", "ml10-smoke", "--runner", "local", "--name", "run", "--training.iterations", "40"]
+    assert exit_code(meta_train.run, arguments) == 1
+    said = capsys.readouterr().err
+    iteration = int(said.partition("iteration ")[2].partition(":")[0])
+    assert "task push, demonstrations" in said
+    assert "003" in said
+    assert "--resume runs/run --on-nonfinite skip" in said
+    newest = Checkpoints(Path("runs/run/checkpoints"), 3).newest()
+    assert newest.manifest.iteration == iteration - 1
+    assert np.isfinite(newest.state.parameters).all()
+
+    assert exit_code(meta_train.run, ["--resume", "run", "--runner", "local"]) == 1
+    assert f"iteration {iteration}: a loss or a gradient is not finite" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("spoilt")
+def test_a_run_may_go_on_without_the_steps_that_are_not_finite(train, capsys: pytest.CaptureFixture[str]):
+    finished = train("run", "--training.iterations", "20", "--on-nonfinite", "skip")
+    assert finished.manifest.iteration == 20
+    assert np.isfinite(finished.state.parameters).all()
+    printed = capsys.readouterr().out
+    assert "warning: iteration " in printed
+    assert "the step is not taken" in printed
+    for line in Path("runs/run/tracking.jsonl").read_text().splitlines():
+        json.loads(line, parse_constant=pytest.fail)
+    half = train("parts", "--training.iterations", "11", "--on-nonfinite", "skip")
+    assert half.manifest.iteration == 11
+    whole = train("parts", "--training.iterations", "20", "--on-nonfinite", "skip", resume=True)
+    assert all(map(np.array_equal, whole.state[1:], finished.state[1:]))
+
+
+def test_a_collapse_is_told_once_when_it_has_lasted():
+    watch = CollapseWatch()
+
+    def look(number: int, share: float) -> str | None:
+        return watch.look(number, {"sub_skill_share/0": share, "sub_skill_share/1": 1 - share, "agreement": 1.0})
+
+    assert [look(number, 0.995) for number in range(99)] == [None] * 99
+    assert look(99, 0.6) is None
+    assert [look(number, 0.001) for number in range(100, 199)] == [None] * 99
+    told = look(199, 0.001)
+    assert told is not None
+    assert "sub-skill 1 has taken over 99% of the states for 100 iterations, up to 199" in told
+    assert "--training.learning-rate" in told
+    assert look(200, 0.001) is None
+    assert all(CollapseWatch().look(number, {"sub_skill_share/0": 1.0}) is None for number in range(150))
+
+
+# Evaluations on the way
+
+
+def test_an_evaluation_that_was_dropped_is_made_up(train, workplace: Path):
+    schedule = ("--training.checkpoint-every", "2", "--training.checkpoints-kept", "1", "--evaluation.every", "2")
+    train("whole", "--training.iterations", "6", *schedule)
+    train("parts", "--training.iterations", "4", *schedule)
+    made = workplace / "runs" / "parts" / "evaluations" / "0000002"
+    for path in made.iterdir():
+        path.unlink()
+    made.rmdir()
+    # The run stopped at 4 iterations has no evaluation of those: they were the last.
+    train("parts", "--training.iterations", "6", *schedule, resume=True)
+    evaluations = workplace / "runs" / "parts" / "evaluations"
+    assert (evaluations / "0000004" / "episodes.jsonl").exists()
+    for path in evaluations.rglob("*.jsonl"):
+        twin = workplace / "runs" / "whole" / "evaluations" / path.relative_to(evaluations)
+        assert path.read_bytes() == twin.read_bytes()
+
+
+# Full disks
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 1 MB."""
+    path = tmp_path / "disk"
+    path.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(path)], capture_output=True)
+    if mounted.returncode:
+        pytest.skip(f"no right to mount a small disk: {mounted.stderr.decode()}")
+    yield path
+    subprocess.run(["umount", "-l", str(path)], check=True)
+
+
+def fill(disk: Path, but: int) -> Path:
+    """Leave so many bytes free."""
+    filler = disk / "filler"
+    free = os.statvfs(disk).f_bavail * os.statvfs(disk).f_bsize
+    filler.write_bytes(b"0" * (free - but))
+    return filler
+
+
+@pytest.mark.parametrize("left", [0, 20_000])
+def test_a_full_disk_stops_a_run_which_goes_on_when_there_is_space(
+    train, small_disk: Path, left: int, capsys: pytest.CaptureFixture[str]
+):
+    undisturbed = train("whole", "--training.iterations", "4")
+    runs = ("--runs", str(small_disk), "--name", "run", "--preset", "ml10-smoke", "--runner", "local")
+    meta_train.run([*runs, "--training.iterations", "2", *QUICK_EVALUATION])
+    filler = fill(small_disk, but=left)
+    capsys.readouterr()
+    arguments = ["--resume", str(small_disk / "run"), "--training.iterations", "4", "--runner", "local"]
+    assert exit_code(meta_train.run, arguments) == 1
+    said = capsys.readouterr().err
+    assert "Traceback" not in said
+    assert f"error: {small_disk / 'run'}" in said
+    assert " needs " in said
+    assert "bytes" in said
+    assert [path.name for path in Checkpoints(small_disk / "run" / "checkpoints", 3).all()] == ["iteration-0000002"]
+    filler.unlink()
+    meta_train.run(arguments)
+    resumed = Checkpoints(small_disk / "run" / "checkpoints", 3).newest()
+    assert all(map(np.array_equal, resumed.state[1:], undisturbed.state[1:]))
+
+
+def test_no_half_of_a_data_set_or_of_rows_counts(small_disk: Path, data):
+    dataset = data["reach"]
+    draw = np.random.default_rng(0)
+    attempts = [
+        Attempt(index, [0.0], 10, draw.normal(size=(300, 39)).astype(np.float32), np.zeros((299, 4), np.float32))
+        for index in range(20)
+    ]
+    with pytest.raises(DiskFullError, match=rf"{small_disk}.*needs \d+ bytes"):
+        DemoStore(small_disk).save(dataset.id, "reach", attempts, failed=0, settings={})
+    assert DemoStore(small_disk).load(dataset.id, "reach") is None
+    filler = fill(small_disk, but=0)
+    row = EpisodeResult.model_construct(suite="x" * 10_000)
+    with pytest.raises(DiskFullError, match=r"rows.jsonl: needs \d+ bytes"):
+        write_rows(small_disk / "rows.jsonl", [row])
+    assert not (small_disk / "rows.jsonl").exists()
+    filler.unlink()
