@@ -131,7 +131,9 @@ class Checkpoint:
     def state(self) -> OuterState:
         """The learner's state, a new copy each time."""
         flat = flatten({name: torch.from_numpy(array) for name, array in self.parameters.items()}).numpy()
-        return OuterState(self.manifest.iteration, flat, **{name: array.copy() for name, array in self._moments.items()})
+        return OuterState(
+            self.manifest.iteration, flat, **{name: array.copy() for name, array in self._moments.items()}
+        )
 
 
 class Checkpoints:

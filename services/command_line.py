@@ -57,7 +57,7 @@ def config_from(preset: str, file: Path | None) -> ExperimentConfig:
         if not isinstance(given, dict):
             raise ConfigError(f"--config: got {file} with {type(given).__name__} in it; wanted keys with values")
         _merge(settings, given, str(file), "")
-    return _checked(settings)
+    return _checked(settings, "" if file is None else f"{file}: ")
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -108,11 +108,11 @@ def _merge(settings: dict[str, Any], given: dict[Any, Any], file: str, prefix: s
             settings[key] = value
 
 
-def _checked(settings: dict[str, Any]) -> ExperimentConfig:
+def _checked(settings: dict[str, Any], origin: str = "") -> ExperimentConfig:
     try:
         return ExperimentConfig.model_validate(settings)
     except ValidationError as error:
-        raise ConfigError(explain(error)) from error
+        raise ConfigError("\n".join(f"{origin}{line}" for line in explain(error).splitlines())) from error
 
 
 def peek(arguments: Sequence[str], **options: Any) -> argparse.Namespace:

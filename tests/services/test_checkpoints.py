@@ -58,7 +58,10 @@ def test_what_is_saved_is_read_to_the_bit(tmp_path: Path):
     assert read.constants["observation_mean"].tolist() == [0, 1]
     assert (read.manifest.iteration, read.manifest.loss, read.manifest.mlflow_run_id) == (3, 0.5, "run")
     assert read.manifest.config == ExperimentConfig(seed=7)
-    assert set(read.manifest.files) == {path.name for path in read.path.iterdir()} - {"manifest.json", "manifest.sha256"}
+    assert set(read.manifest.files) == {path.name for path in read.path.iterdir()} - {
+        "manifest.json",
+        "manifest.sha256",
+    }
 
 
 @pytest.mark.parametrize("before", [1, 4])
