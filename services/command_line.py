@@ -30,6 +30,7 @@ T = TypeVar("T")
 DEFAULT_PRESET = "ml10-quick"
 MOST_BYTES = 2**16
 """In a file of settings; PyYAML may need a second for so many."""
+DEEPEST = 20
 MOST_CHARACTERS = 500
 """Of what PyYAML says."""
 PROGRAMS = {
@@ -61,13 +62,20 @@ def config_from(preset: str, file: Path | None) -> ExperimentConfig:
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """Refuses aliases: a few lines of them stand for more than any memory holds."""
+    """Refuses aliases, a few lines of which stand for more than any memory holds, and deep nesting."""
+
+    depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
+        if self.check_event(yaml.AliasEvent) or self.depth == DEEPEST:
             mark = self.peek_event().start_mark
-            raise yaml.MarkedYAMLError(problem="found an alias, which no setting needs", problem_mark=mark)
-        return super().compose_node(parent, index)
+            raise yaml.MarkedYAMLError(
+                problem="found an alias or deep nesting, which no setting needs", problem_mark=mark
+            )
+        self.depth += 1
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
 
 
 def _read_yaml(file: Path) -> Any:
@@ -77,8 +85,8 @@ def _read_yaml(file: Path) -> Any:
             return loader.get_single_data()
         finally:
             loader.dispose()
-    # Besides its own errors, PyYAML lets through what comes of dates and numbers that are none, and of deep nesting.
-    except (OSError, yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+    # Besides its own errors, PyYAML lets through what comes of dates, numbers and tags that are none.
+    except (OSError, yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError) as error:
         raise ConfigError(f"--config: got {file}, {_cut(str(error))}; wanted a readable YAML file") from error
 
 
