@@ -44,12 +44,17 @@ def shown(value: object) -> str:
     return _shortened.repr(value)
 
 
-def explain(error: ValidationError) -> str:
-    """Return one line for each wrong value, of the first ones: the key, what it got, and what was wanted."""
+def explain(error: ValidationError, whole: str = "settings") -> str:
+    """Return one line for each wrong value, of the first ones: the key, what it got, and what was wanted.
+
+    Args:
+        error: of a model of pydantic's.
+        whole: what to name where no key is to blame.
+    """
     problems = error.errors(include_url=False)
-    lines = []
+    lines: list[str] = []
     for problem in problems[:MOST_LINES]:
-        where = ".".join(part if isinstance(part, str) else str(part) for part in problem["loc"]) or "settings"
+        where = ".".join(map(str, problem["loc"])) or whole
         message = problem["msg"].removeprefix("Value error, ")
         # A validator of our own names the key, the value and what was wanted by itself.
         own = problem["type"] == "value_error"

@@ -28,8 +28,10 @@ MANIFEST, SEAL = "manifest.json", "manifest.sha256"
 PARAMETERS, OPTIMISER, CONSTANTS = "parameters.safetensors", "optimiser.safetensors", "constants.safetensors"
 MOST_MANIFEST = 2**22
 """Bytes of a manifest."""
-MOST_TENSORS = 2**30
-"""Bytes of a file of tensors: a hundred times those of the paper's networks."""
+MOST_TENSORS = 2**32
+"""Bytes of all parameters together: a hundred times those of the paper's networks."""
+MOST_CONSTANTS = 2**26
+"""Bytes of what a method learned once."""
 MOST_HEADER = 2**20
 """Bytes of a file of tensors besides the tensors."""
 
@@ -62,9 +64,11 @@ class Manifest(BaseModel):
 
     @field_validator("shapes")
     @classmethod
-    def _weights_are_matrices(cls, shapes: dict[str, Shape]) -> dict[str, Shape]:
+    def _can_be_held(cls, shapes: dict[str, Shape]) -> dict[str, Shape]:
         if odd := [name for name, shape in shapes.items() if name.endswith(".weight") and len(shape) < 2]:
             raise ValueError(f"shapes: got {shapes[odd[0]]} for {shown(odd[0])}; wanted a matrix")
+        if (total := 4 * sum(map(math.prod, shapes.values()))) > MOST_TENSORS:
+            raise ValueError(f"shapes: got {total} bytes of parameters; wanted at most {MOST_TENSORS}")
         return shapes
 
     @property
@@ -106,11 +110,9 @@ class Checkpoint:
 
     def _read(self, name: str, shapes: Mapping[str, Sequence[int]] | None) -> dict[str, np.ndarray]:
         """Return the tensors of a file, which have these names and shapes, in this order."""
-        wanted = MOST_TENSORS if shapes is None else 4 * sum(map(math.prod, shapes.values()))
-        if wanted > MOST_TENSORS:
-            raise self._damaged(MANIFEST, f"shapes of {wanted} bytes", f"at most {MOST_TENSORS}")
+        most = MOST_CONSTANTS if shapes is None else 4 * sum(map(math.prod, shapes.values())) + MOST_HEADER
         try:
-            tensors = load(checked_file(self.path, name, self.manifest.files.get(name), wanted + MOST_HEADER))
+            tensors = load(checked_file(self.path, name, self.manifest.files.get(name), most))
         except OSError as error:
             raise self._damaged(name, _in_words(error), "what its digest in the manifest says") from error
         except (SafetensorError, KeyError, ValueError, TypeError, OverflowError) as error:  # KeyError: an odd dtype
@@ -235,9 +237,9 @@ class Checkpoints:
 
     def _let_go(self) -> None:
         """Remove what is older than the newest `kept` whole checkpoints, damaged ones too, but not the best."""
-        newest, best = list(self._sound())[-self.kept :], self.best()
-        for path in self.all():
-            if path < newest[0] and path != best and not path.is_symlink():
+        whole, best = list(self._sound()), self.best()
+        for path in self.all() if len(whole) > self.kept else []:
+            if path < whole[-self.kept] and path != best and not path.is_symlink():
                 shutil.rmtree(path)
 
 
@@ -253,13 +255,14 @@ def _read_manifest(path: Path) -> Manifest:
             raise OSError(f"a file whose SHA-256 is not the one in {SEAL}")
         manifest = Manifest.model_validate_json(text)
     except (OSError, ValidationError) as error:
-        got = "; ".join(explain(error).splitlines()) if isinstance(error, ValidationError) else _in_words(error)
+        got = _in_words(error) if isinstance(error, OSError) else "; ".join(explain(error, "manifest").splitlines())
         raise CheckpointError(
             f"{path / MANIFEST}: got {got}; wanted a checkpoint's manifest; use another checkpoint"
         ) from error
-    for name, least in {PARAMETERS: 4 * manifest.size, OPTIMISER: 8 * manifest.size, CONSTANTS: 0}.items():
-        if not (path / name).is_file() or (path / name).stat().st_size < least:
-            raise CheckpointError(f"{path / name}: got nothing; wanted at least {least} bytes; use another checkpoint")
+    for name, least in {PARAMETERS: 4 * manifest.size, OPTIMISER: 8 * manifest.size, CONSTANTS: 1}.items():
+        found = (path / name).stat().st_size if (path / name).is_file() else 0
+        if found < least:
+            raise CheckpointError(f"{path / name}: got {found} bytes; wanted at least {least}; use another checkpoint")
     return manifest
 
 

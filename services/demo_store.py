@@ -95,7 +95,7 @@ class DemoStore:
                 for index, (observations, actions) in enumerate(_read_episodes(path / ARRAYS, metadata.total_episodes))
             )
         except ValidationError as error:
-            raise self._damaged(path / METADATA, "; ".join(explain(error).splitlines())) from error
+            raise self._damaged(path / METADATA, "; ".join(explain(error, "metadata").splitlines())) from error
         except DemonstrationError as error:
             raise DemonstrationError(f"{path / ARRAYS}: {error}") from error
         except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:  # the last four are h5py's

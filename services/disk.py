@@ -91,9 +91,9 @@ def read_file(path: Path, most: int) -> bytes:
     with os.fdopen(descriptor, "rb") as file:
         found = os.fstat(descriptor)
         if not stat.S_ISREG(found.st_mode):
-            raise OSError(errno.EINVAL, "got no regular file", str(path))
+            raise OSError(errno.EINVAL, "is no regular file", str(path))
         if found.st_size > most:
-            raise OSError(errno.EFBIG, f"got {found.st_size} bytes, at most {most} are read", str(path))
+            raise OSError(errno.EFBIG, f"of {found.st_size} bytes, of which at most {most} are read", str(path))
         return file.read(found.st_size)  # it makes room for as many bytes as it is asked for
 
 

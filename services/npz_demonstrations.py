@@ -158,7 +158,8 @@ def _header(content: bytes, name: str) -> _Header:
     size = int.from_bytes(content[8:10], "little")
     found = HEADER.fullmatch(content[10 : 10 + size])
     if content[:8] != b"\x93NUMPY\x01\x00" or found is None:
-        raise DemonstrationError(f"{name}: got {shown(content[:60])}; wanted an array in numpy's format 1.0")
+        got = shown(content[10:110].decode("latin1"))
+        raise DemonstrationError(f"{name}: got the header {got}; wanted numbers or text in numpy's format 1.0")
     header = _Header(np.dtype(found[1].decode()), tuple(map(int, found[2].split(b","))))
     wanted = math.prod(header.shape) * header.dtype.itemsize
     if (there := len(content) - 10 - size) != wanted:

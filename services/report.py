@@ -60,7 +60,7 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
                 found = _Metrics.model_validate(value, strict=True)
                 by_step.setdefault(found.step, {"iteration": found.step}).update(found.values)
         except ValidationError as error:
-            got = "; ".join(explain(error).splitlines())
+            got = "; ".join(explain(error, "record").splitlines())
             raise RowError(f"{path}:{number}: {got}; wanted a whole record; remove the line") from error
     return [by_step[step] for step in sorted(by_step)]
 

@@ -89,7 +89,7 @@ def read_rows(path: Path, model: type[Row]) -> list[Row]:
         try:
             rows.append(model.model_validate_json(line, strict=True))
         except ValidationError as error:
-            got = "; ".join(explain(error).splitlines())
+            got = "; ".join(explain(error, "row").splitlines())
             raise RowError(f"{path}:{number}: {got}; wanted a whole {model.__name__}; make the file again") from error
     return rows
 

@@ -501,8 +501,8 @@ def misplace(path: Path, outside: Path, draw: Random) -> None:
 
 def npy(array: np.ndarray, descr: str | None = None, shape: str | None = None) -> bytes:
     """Return an array in numpy's format, with another header if so wanted."""
-    descr, shape = descr or np.lib.format.dtype_to_descr(array.dtype), shape or str(array.shape)
-    header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}".encode("latin1")
+    said = f"'descr': '{descr or array.dtype.str}', 'fortran_order': False, 'shape': {shape or array.shape}, "
+    header = f"{{{said}}}".encode()
     header += b" " * (-(len(header) + 11) % 64) + b"\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + array.tobytes()
 
@@ -517,7 +517,7 @@ def archive(members: dict[str, bytes]) -> bytes:
 
 def npz(arrays: dict[str, np.ndarray], *, packed: bool) -> bytes:
     file = io.BytesIO()
-    (np.savez_compressed if packed else np.savez)(file, **arrays)
+    (np.savez_compressed if packed else np.savez)(file, **arrays)  # type: ignore[arg-type]
     return file.getvalue()
 
 

@@ -63,7 +63,7 @@ def try_out(name: str, inputs: int, folder: Path) -> dict[str, float]:
 
     @settings(
         max_examples=inputs - inputs // 2, database=None, derandomize=True, deadline=None, phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
+        suppress_health_check=tuple(HealthCheck),
     )  # fmt: skip
     @given(randoms(use_true_random=False), data())
     def of_hypothesis(draw: Random, drawn: DataObject) -> None:
