@@ -280,6 +280,15 @@ def test_tensors_that_are_not_as_the_manifest_says_are_refused(tmp_path: Path, n
     assert str(path / name) in str(error.value)
 
 
+def test_a_type_that_numpy_does_not_have_is_refused(tmp_path: Path):
+    path = save(Checkpoints(tmp_path, kept=1), start())
+    header = json.dumps({"mean": {"dtype": "F8_E4M3", "shape": [8], "data_offsets": [0, 8]}}).encode()
+    (path / "constants.safetensors").write_bytes(len(header).to_bytes(8, "little") + header + bytes(8))
+    reseal(path, files={file: hashlib.sha256((path / file).read_bytes()).hexdigest() for file in TENSORS})
+    with pytest.raises(CheckpointError, match=r"constants.safetensors: got "):
+        Checkpoint(path)
+
+
 def test_no_link_leads_out_of_a_checkpoint(tmp_path: Path):
     checkpoints = Checkpoints(tmp_path / "checkpoints", kept=2)
     path = save(checkpoints, start())

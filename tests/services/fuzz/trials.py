@@ -63,7 +63,7 @@ def try_out(name: str, inputs: int, folder: Path) -> dict[str, float]:
 
     @settings(
         max_examples=inputs - inputs // 2, database=None, derandomize=True, deadline=None, phases=[Phase.generate],
-        suppress_health_check=tuple(HealthCheck),
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.large_base_example],
     )  # fmt: skip
     @given(randoms(use_true_random=False), data())
     def of_hypothesis(draw: Random, drawn: DataObject) -> None:
