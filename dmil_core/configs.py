@@ -14,8 +14,10 @@ __all__ = [
     "TrainingConfig",
 ]
 
-Count = Annotated[int, Field(ge=1)]
-Seed = Annotated[int, Field(ge=0)]
+Count = Annotated[int, Field(ge=1, le=10**9)]
+Size = Annotated[int, Field(ge=1, le=10_000)]
+"""A count of what is held in memory together."""
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
@@ -31,7 +33,7 @@ class SuiteConfig(Settings):
 
     name: Literal["ml10", "ml10-reference"] = "ml10"
     """ml10: the benchmark's own split; ml10-reference: the split of the authors' released code."""
-    horizon: Count = 300
+    horizon: Size = 300
     """Steps in an episode; it is a success if the task is solved at any of them."""
     train_tasks: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     """Use these meta-training tasks instead of all of the suite's."""
@@ -42,13 +44,13 @@ class SuiteConfig(Settings):
 class DemonstrationConfig(Settings):
     """How the scripted experts' demonstrations are collected."""
 
-    per_task: Count = 100
+    per_task: Size = 100
     """Demonstrations of each task, training and held-out ones together."""
-    held_out: Count = 20
+    held_out: Size = 20
     """Of these, how many are kept from meta-training, as support sets for evaluation."""
     noise: NotNegative = 0.1
     """Standard deviation of the noise added to the executed action; the clean action is stored."""
-    trailing_steps: Annotated[int, Field(ge=0)] = 10
+    trailing_steps: Annotated[int, Field(ge=0, le=10**9)] = 10
     """Steps recorded after the task is solved."""
     seed: Seed = 0
     """Names the demonstrations; they do not depend on the experiment's seed."""
@@ -67,11 +69,11 @@ class DmilConfig(Settings):
 
     name: Literal["dmil"] = "dmil"
     """The method."""
-    sub_skills: Count = 3
+    sub_skills: Size = 3
     """K, the number of sub-skills (Table 4)."""
-    hidden_layers: Count = 4
+    hidden_layers: Size = 4
     """Layers of ReLU units in each network (F.2)."""
-    hidden_units: Count = 512
+    hidden_units: Size = 512
     """Units in each hidden layer (F.2)."""
     output_scale: Positive = 1.0
     """Scale of the output layers' first weights, against He's; the paper names no initialisation."""
@@ -79,13 +81,13 @@ class DmilConfig(Settings):
     """Standardise observations by the statistics of the meta-training demonstrations."""
     inner_learning_rate: Positive = 5e-4
     """α (Table 9)."""
-    inner_steps: Count = 3
+    inner_steps: Size = 3
     """Steps of the inner loop, Table 9's fine-tune iterations."""
     continuity_weight: NotNegative = 0.1
     """λ (Table 9; Appendix C says 1)."""
     order: Literal["first", "second"] = "second"
     """Of the meta-gradient: exact, or taken at the adapted parameters."""
-    trajectories: Count = 16
+    trajectories: Size = 16
     """Trajectories in each of τ1 to τ4 (Table 9)."""
     window: Count | None = None
     """Cut each trajectory to so many steps at a random place; none takes it whole."""
@@ -94,11 +96,11 @@ class DmilConfig(Settings):
 class TrainingConfig(Settings):
     """The outer loop."""
 
-    iterations: Annotated[int, Field(ge=0)] = 2000
+    iterations: Annotated[int, Field(ge=0, le=10**9)] = 2000
     """Outer steps."""
-    tasks_per_iteration: Count = 10
+    tasks_per_iteration: Size = 10
     """Tasks in a batch, sampled without replacement where there are enough."""
-    slots_per_group: Count = 1
+    slots_per_group: Size = 1
     """Tasks whose gradients one worker computes and adds together; part of the result, unlike the number of workers."""
     learning_rate: Positive = 1e-4
     """β of the outer Adam (Table 9)."""
@@ -113,13 +115,13 @@ class TrainingConfig(Settings):
 class EvaluationConfig(Settings):
     """Few-shot adaptation and the episodes that judge it."""
 
-    shots: Annotated[tuple[Count, ...], Field(min_length=1)] = (1, 3)
+    shots: Annotated[tuple[Size, ...], Field(min_length=1, max_length=100)] = (1, 3)
     """Sizes of the support set."""
-    episodes: Count = 20
+    episodes: Size = 20
     """Episodes of each task for each size (Table 4)."""
-    support_draws: Count = 4
+    support_draws: Size = 4
     """Different support sets that a task's episodes are spread over."""
-    fine_tuning_steps: Annotated[int, Field(ge=0)] = 50
+    fine_tuning_steps: Annotated[int, Field(ge=0, le=10**9)] = 50
     """Steps of adaptation to the support set (E.4)."""
     learning_rate: Positive = 1e-2
     """Of this adaptation (E.4)."""

@@ -28,7 +28,8 @@ class Demonstration:
         actions: what the expert did at each step, in the environment's units.
 
     Raises:
-        DemonstrationError: for no step at all, unequal lengths, a wrong rank or a number that is not finite.
+        DemonstrationError: for no step at all, unequal lengths, a wrong rank, numbers that are not float32 or not
+            finite. A single step can be learned from: it has no continuity, and counts in every other loss.
     """
 
     id: str
@@ -43,6 +44,11 @@ class Demonstration:
                 raise DemonstrationError(
                     f"demonstration {self.id} of {self.task}: {field} has the shape {values.shape}; "
                     "wanted (steps, dimensions) with at least one of each; drop the demonstration"
+                )
+            if values.dtype != np.float32:
+                raise DemonstrationError(
+                    f"demonstration {self.id} of {self.task}: {field} has numbers of the type {values.dtype}; wanted "
+                    "float32; convert them"
                 )
             if not np.isfinite(values).all():
                 step = int(np.argwhere(~np.isfinite(values).all(axis=1))[0, 0])

@@ -1,10 +1,15 @@
 """Errors told in words: those that are the user's to mend, and those that stop a run all the same."""
 
+import reprlib
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
-__all__ = ["RunError", "UserError", "WorkError", "piece_of_work"]
+from pydantic import ValidationError
+
+__all__ = ["RunError", "UserError", "WorkError", "explain", "piece_of_work", "shown"]
+
+MOST_LINES = 10
 
 
 class UserError(ValueError):
@@ -61,3 +66,43 @@ def piece_of_work(where: str, **piece: str | int) -> Iterator[None]:
     except Exception as error:
         problem = traceback.format_exception_only(error)[-1].strip()
         raise WorkError(where, problem, traceback.format_exc(), piece) from error
+
+
+class _Shortened(reprlib.Repr):
+    """Shortens also what has no decimal digits: Python refuses to write out integers of some thousand of them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxstring = self.maxother = 100
+
+    def repr_int(self, x: int, level: int) -> str:
+        return super().repr_int(x, level) if x.bit_length() < 1000 else f"an integer of {x.bit_length()} bits"
+
+
+_shortened = _Shortened()
+
+
+def shown(value: object) -> str:
+    """Return a value as it stands in a message: `repr`, cut short however large the value is."""
+    return _shortened.repr(value)
+
+
+def explain(error: ValidationError, whole: str = "settings") -> str:
+    """Return one line for each wrong value, of the first ones: the key, what it got, and what was wanted.
+
+    Args:
+        error: of a model of pydantic's.
+        whole: what to name where no key is to blame.
+    """
+    problems = error.errors(include_url=False)
+    lines: list[str] = []
+    for problem in problems[:MOST_LINES]:
+        where = ".".join(map(str, problem["loc"])) or whole
+        message = problem["msg"].removeprefix("Value error, ")
+        # A validator of our own names the key, the value and what was wanted by itself.
+        own = problem["type"] == "value_error"
+        short = where if len(where) <= 100 else f"{where[:50]}...{where[-50:]}"
+        lines.append(message if own else f"{short}: got {shown(problem['input'])}; {message[0].lower()}{message[1:]}")
+    if len(problems) > MOST_LINES:
+        lines.append(f"and {len(problems) - MOST_LINES} more")
+    return "\n".join(lines)

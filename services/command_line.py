@@ -13,13 +13,13 @@ import yaml
 from pydantic import ValidationError
 
 from dmil_core.configs import PRESETS, EvaluationConfig, ExperimentConfig
-from dmil_core.errors import RunError, UserError
+from dmil_core.errors import RunError, UserError, explain, shown
+from services.disk import read_file
 
 __all__ = [
     "ConfigError",
     "config_from",
     "exit_code",
-    "explain",
     "main",
     "parse",
     "peek",
@@ -28,6 +28,11 @@ __all__ = [
 
 T = TypeVar("T")
 DEFAULT_PRESET = "ml10-quick"
+MOST_BYTES = 2**16
+"""In a file of settings; PyYAML may need a second for so many."""
+DEEPEST = 20
+MOST_CHARACTERS = 500
+"""Of what PyYAML says."""
 PROGRAMS = {
     "meta-train": "collect demonstrations, meta-train, evaluate",
     "collect-demos": "let the scripted experts make demonstrations",
@@ -49,14 +54,44 @@ def config_from(preset: str, file: Path | None) -> ExperimentConfig:
         raise ConfigError(f"--preset: got {preset!r}; wanted one of {', '.join(PRESETS)}")
     settings = PRESETS[preset].model_dump()
     if file is not None:
-        try:
-            given = yaml.safe_load(file.read_text())
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise ConfigError(f"--config: got {file}, {error}; wanted a readable YAML file") from error
+        given = _read_yaml(file)
         if not isinstance(given, dict):
             raise ConfigError(f"--config: got {file} with {type(given).__name__} in it; wanted keys with values")
         _merge(settings, given, str(file), "")
-    return _checked(settings)
+    return _checked(settings, "" if file is None else f"{file}: ")
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Refuses aliases, a few lines of which stand for more than any memory holds, and deep nesting."""
+
+    depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent) or self.depth == DEEPEST:
+            mark = self.peek_event().start_mark
+            raise yaml.MarkedYAMLError(
+                problem="found an alias or deep nesting, which no setting needs", problem_mark=mark
+            )
+        self.depth += 1
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
+
+
+def _read_yaml(file: Path) -> Any:
+    try:
+        loader = _PlainLoader(read_file(file, MOST_BYTES).decode())
+        try:
+            return loader.get_single_data()
+        finally:
+            loader.dispose()
+    # Besides its own errors, PyYAML lets through what comes of dates, numbers and tags that are none.
+    except (OSError, yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError) as error:
+        raise ConfigError(f"--config: got {file}, {_cut(str(error))}; wanted a readable YAML file") from error
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]}..."
 
 
 def with_evaluation(config: ExperimentConfig, evaluation: EvaluationConfig) -> ExperimentConfig:
@@ -71,32 +106,21 @@ def with_evaluation(config: ExperimentConfig, evaluation: EvaluationConfig) -> E
 def _merge(settings: dict[str, Any], given: dict[Any, Any], file: str, prefix: str) -> None:
     for key, value in given.items():
         if key not in settings:
-            raise ConfigError(f"{file}: got the unknown key {prefix}{key}; wanted one of {', '.join(settings)}")
+            named = key if isinstance(key, str) and len(key) < 50 else shown(key)
+            raise ConfigError(f"{file}: got the unknown key {prefix}{named}; wanted one of {', '.join(settings)}")
         if isinstance(settings[key], dict):
             if not isinstance(value, dict):
-                raise ConfigError(f"{file}: {prefix}{key}: got {value!r}; wanted keys: {', '.join(settings[key])}")
+                raise ConfigError(f"{file}: {prefix}{key}: got {shown(value)}; wanted keys: {', '.join(settings[key])}")
             _merge(settings[key], value, file, f"{prefix}{key}.")
         else:
             settings[key] = value
 
 
-def _checked(settings: dict[str, Any]) -> ExperimentConfig:
+def _checked(settings: dict[str, Any], origin: str = "") -> ExperimentConfig:
     try:
         return ExperimentConfig.model_validate(settings)
     except ValidationError as error:
-        raise ConfigError(explain(error)) from error
-
-
-def explain(error: ValidationError) -> str:
-    """Return one line for each wrong setting: the key, what it got, and what was wanted."""
-    lines = []
-    for problem in error.errors():
-        where = ".".join(map(str, problem["loc"])) or "settings"
-        message = problem["msg"].removeprefix("Value error, ")
-        # A validator of our own names the key, the value and what was wanted by itself.
-        own = problem["type"] == "value_error"
-        lines.append(message if own else f"{where}: got {problem['input']!r}; {message[0].lower()}{message[1:]}")
-    return "\n".join(lines)
+        raise ConfigError("\n".join(f"{origin}{line}" for line in explain(error).splitlines())) from error
 
 
 def peek(arguments: Sequence[str], **options: Any) -> argparse.Namespace:

@@ -91,19 +91,22 @@ def read_file(path: Path, most: int) -> bytes:
     with os.fdopen(descriptor, "rb") as file:
         found = os.fstat(descriptor)
         if not stat.S_ISREG(found.st_mode):
-            raise OSError(errno.EINVAL, "got no regular file", str(path))
+            raise OSError(errno.EINVAL, "is no regular file", str(path))
         if found.st_size > most:
-            raise OSError(errno.EFBIG, f"got {found.st_size} bytes, at most {most} are read", str(path))
-        return file.read(most)
+            raise OSError(errno.EFBIG, f"of {found.st_size} bytes, of which at most {most} are read", str(path))
+        return file.read(found.st_size)  # it makes room for as many bytes as it is asked for
 
 
 def inside(root: Path, name: str) -> Path:
     """Return the path `name` under `root`, with all links followed.
 
     Raises:
-        OSError: if it lies elsewhere: an absolute path, one with ``..`` or a link that leads out.
+        OSError: if it lies elsewhere: an absolute path, one with ``..``, a link that leads out or to itself.
     """
-    path = (root / name).resolve()
+    try:
+        path = (root / name).resolve()
+    except RuntimeError as error:  # so Python 3.11 and 3.12 say it
+        raise OSError(errno.ELOOP, "is a link to itself", name) from error
     if not path.is_relative_to(root.resolve()):
         raise OSError(errno.EPERM, f"lies outside {root}", name)
     return path

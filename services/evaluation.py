@@ -170,11 +170,13 @@ class Evaluations:
 
 
 def write_evaluation(evaluation: Evaluation, folder: Path) -> None:
-    """Write an evaluation's rows to ``episodes.jsonl`` and ``adaptations.jsonl``, in place of those there were."""
+    """Write an evaluation's rows to ``adaptations.jsonl`` and ``episodes.jsonl``, in place of those there were.
+
+    Each is written whole, the episodes last: where they are, the evaluation is complete.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    for name, rows in (("episodes.jsonl", evaluation.episodes), ("adaptations.jsonl", evaluation.adaptations)):
-        (folder / name).unlink(missing_ok=True)
-        write_rows(folder / name, rows)
+    write_rows(folder / "adaptations.jsonl", evaluation.adaptations)
+    write_rows(folder / "episodes.jsonl", evaluation.episodes)
 
 
 def _episode_rows(row: Mapping[str, object], trial: Trial, outcome: TrialOutcome) -> list[EpisodeResult]:

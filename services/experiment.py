@@ -297,10 +297,9 @@ class Experiment:
                             save_now()
                             raise NonFiniteError(told, checkpoints.folder.parent)
                         console.print(f"warning: {told}; the step is not taken")
-                        metrics = {name: value for name, value in metrics.items() if np.isfinite(value)}
                     else:
                         losses.append(metrics["high_loss_after"] + metrics["low_loss_after"])
-                    tracker.metrics(done, metrics)
+                    tracker.metrics(done, {name: value for name, value in metrics.items() if np.isfinite(value)})
                     bar.advance(1, _in_words(metrics))
                     if warning := collapse.look(done, metrics):
                         console.print(f"warning: {warning}")

@@ -1,17 +1,20 @@
 """What a run shows at its end: the table on the terminal, and its report folder with tables and plots."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated, Any
 
 import matplotlib
 
 matplotlib.use("Agg")
 from matplotlib import pyplot
 from matplotlib.axes import Axes
+from pydantic import BaseModel, Field, RootModel, ValidationError
 
+from dmil_core.errors import explain
 from services.checkpoints import Checkpoint
 from services.progress import console
+from services.results import RowError, read_lines
 from services.summary import AGAINST_COLLAPSE, COLLAPSED, Summary, rates, table, table_markdown, write_summary
 from services.tracking import Tracker
 
@@ -29,16 +32,34 @@ SMOOTHED = 50
 """A curve is drawn through so many means at most."""
 
 
+class _Metrics(BaseModel):
+    step: Annotated[int, Field(ge=0, lt=2**63)]
+    values: dict[str, float]
+
+
+class _Record(RootModel[tuple[str, Any]]):
+    """One line of ``tracking.jsonl``."""
+
+
 def read_metrics(folder: Path) -> list[dict[str, float]]:
-    """Return the metrics of each iteration from a run's ``tracking.jsonl``; an iteration done again counts once."""
+    """Return the metrics of each iteration from a run's ``tracking.jsonl``; an iteration done again counts once.
+
+    Raises:
+        RowError: names the file and the line that is not as the tracker writes it.
+    """
     path = folder / "tracking.jsonl"
     if not path.exists():
         return []
     by_step: dict[int, dict[str, float]] = {}
-    with path.open() as file:
-        for kind, value in map(json.loads, file):
+    for number, line in read_lines(path):
+        try:
+            kind, value = _Record.model_validate_json(line).root
             if kind == "metrics":
-                by_step.setdefault(value["step"], {"iteration": value["step"]}).update(value["values"])
+                found = _Metrics.model_validate(value, strict=True)
+                by_step.setdefault(found.step, {"iteration": found.step}).update(found.values)
+        except ValidationError as error:
+            got = "; ".join(explain(error, "record").splitlines())
+            raise RowError(f"{path}:{number}: {got}; wanted a whole record; remove the line") from error
     return [by_step[step] for step in sorted(by_step)]
 
 

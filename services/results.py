@@ -1,24 +1,35 @@
 """Rows of results: one an episode, one an adaptation, with all that is needed to run them again."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationError
 
-__all__ = ["AdaptationResult", "EpisodeResult", "Split", "write_rows"]
+from dmil_core.errors import UserError, explain
+from services.disk import read_file, write_file
+
+__all__ = ["AdaptationResult", "EpisodeResult", "RowError", "Split", "read_lines", "read_rows", "write_rows"]
 
 Split = Literal["meta-training", "meta-testing"]
+Row = TypeVar("Row", bound=BaseModel)
+MOST_BYTES = 2**30
+"""In a file of rows."""
+LONGEST_LINE = 2**20
+
+
+class RowError(UserError):
+    """A line that is no whole row."""
 
 
 class _Row(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     suite: str
     protocol: str
     method: str
     checkpoint: str
-    """SHA-256 of the checkpoint's manifest."""
+    """The checkpoint's digest, which covers all but its loss and the id of the MLflow run."""
     split: Split
     task: str
     shots: int
@@ -59,6 +70,45 @@ class AdaptationResult(_Row):
 
 
 def write_rows(path: Path, rows: Iterable[BaseModel]) -> None:
-    """Append rows to a file of JSON lines."""
-    with path.open("a") as file:
-        file.writelines(row.model_dump_json() + "\n" for row in rows)
+    """Write a file of JSON lines, whole, in place of the one there was.
+
+    Raises:
+        DiskFullError: for want of space; the file is then what it was.
+    """
+    write_file(path, "".join(row.model_dump_json() + "\n" for row in rows))
+
+
+def read_rows(path: Path, model: type[Row]) -> list[Row]:
+    """Read the rows of a file of JSON lines.
+
+    Raises:
+        RowError: names the file and the line that is not a row as `write_rows` writes it.
+    """
+    rows = []
+    for number, line in read_lines(path):
+        try:
+            rows.append(model.model_validate_json(line, strict=True))
+        except ValidationError as error:
+            got = "; ".join(explain(error, "row").splitlines())
+            raise RowError(f"{path}:{number}: {got}; wanted a whole {model.__name__}; make the file again") from error
+    return rows
+
+
+def read_lines(path: Path) -> Iterator[tuple[int, bytes]]:
+    """Yield the lines of a file with their numbers from 1.
+
+    Raises:
+        RowError: if there is no such file, it is too large or a line too long, or its last line has no end: whoever
+            wrote it was killed.
+    """
+    try:
+        lines = read_file(path, MOST_BYTES).split(b"\n")
+    except OSError as error:
+        raise RowError(f"{path}: got {error.strerror}; wanted a file of JSON lines; make it again") from error
+    for number, line in enumerate(lines, start=1):
+        if len(line) > LONGEST_LINE:
+            raise RowError(f"{path}:{number}: got a line of {len(line)} bytes; wanted at most {LONGEST_LINE}")
+        if number < len(lines):
+            yield number, line
+        elif line:
+            raise RowError(f"{path}:{number}: got half a line; wanted a whole one; remove it or make the file again")

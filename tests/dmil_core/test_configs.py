@@ -72,6 +72,11 @@ def test_presets_leave_enough_demonstrations_for_four_disjoint_sets(preset: Expe
         (EvaluationConfig, "fine_tuning_steps", -1),
         (EvaluationConfig, "every", 0),
         (ExperimentConfig, "method", {"sub_skils": 3}),
+        (ExperimentConfig, "seed", 2**63),
+        (DmilConfig, "hidden_units", 10**6),
+        (DemonstrationConfig, "per_task", 10**9),
+        (EvaluationConfig, "shots", (1,) * 101),
+        (TrainingConfig, "iterations", 10**10),
     ],
 )
 def test_impossible_settings_are_refused_by_name(config: type, field: str, value: object) -> None:

@@ -51,6 +51,15 @@ def test_what_cannot_be_learned_from_is_refused_by_name(field: str, values: np.n
 
 
 @pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("field", ["observations", "actions"])
+@pytest.mark.parametrize("dtype", [np.float64, np.int32, bool, object])
+def test_other_numbers_than_float32_are_refused_by_name(field: str, dtype: type) -> None:
+    arrays = {"observations": zeros(5, 2), "actions": zeros(5, 2), field: zeros(5, 2).astype(dtype)}
+    with pytest.raises(DemonstrationError, match=rf"demonstration d7 of reach: {field} has numbers of the type .*32"):
+        Demonstration("d7", "reach", **arrays)
+
+
+@pytest.mark.usefixtures("unchecked")
 def test_unequal_lengths_are_refused_by_name() -> None:
     with pytest.raises(DemonstrationError, match="demonstration d7 of reach: 4 observations for 5 actions"):
         Demonstration("d7", "reach", zeros(4, 2), zeros(5, 2))

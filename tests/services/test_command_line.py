@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -69,6 +70,7 @@ MISTAKES = {
     "unknown preset": (("--preset", "ml99"), ("--preset", "ml99", "ml10-paper", "ml10-quick", "ml10-smoke")),
     "no preset": (("--preset",), ("--preset",)),
 }
+LAUGHS = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}, *{a}, *{a}]\n" for a, b in pairwise("abcdefghijklmnop"))
 FILES = {
     "unknown key": ("method: {sub_skill: 5}", ("method.sub_skill", "sub_skills", "continuity_weight")),
     "unknown section": ("methods: {}", ("methods", "method", "training")),
@@ -78,6 +80,16 @@ FILES = {
     "not a number": ("method: {continuity_weight: .nan}", ("method.continuity_weight", "nan")),
     "list": ("- seed", ("list", "wanted keys")),
     "empty": ("", ("NoneType", "wanted keys")),
+    "alias": ("seed: &s 1\ntraining: {iterations: *s}", ("settings.yaml", "found an alias", "line 2")),
+    "billion laughs": (LAUGHS, ("settings.yaml", "found an alias")),
+    "deep": ("method: " + "[" * 500, ("settings.yaml", "deep nesting")),
+    "large": ("seed: " + "1" * 70_000, ("settings.yaml", "of 70006 bytes, of which at most 65536 are read")),
+    "no day": ("seed: 2001-99-99", ("settings.yaml", "month must be in 1..12")),
+    "huge number": ("seed: 0x" + "f" * 9000, ("settings.yaml: seed: got an integer of 36000 bits", "less than")),
+    "long value": ("method: {order: " + "x" * 9000 + "}", ("settings.yaml: method.order: got 'xxx",)),
+    "code": ("seed: !!python/object/apply:os.system [ls]", ("settings.yaml", "could not determine a constructor")),
+    "too many": ("method: {hidden_units: 1000000}", ("method.hidden_units: got 1000000", "10000")),
+    "no text": ("seed: \0", ("settings.yaml", "unacceptable character")),
     "no YAML": ("seed: [1", ("settings.yaml", "wanted a readable YAML file")),
 }
 
@@ -95,6 +107,7 @@ def test_a_wrong_flag_is_answered_with_what_is_allowed(complaint, flags, words):
 def test_a_wrong_file_is_answered_with_what_is_allowed(complaint, yaml_file, text, words):
     printed = complaint(run, "--runner", "local", "--preset", "ml10-smoke", "--config", str(yaml_file(text)))
     assert all(word in printed for word in words), printed
+    assert len(printed) < 1000, "a message is to be read"
 
 
 @pytest.mark.parametrize("file", ["nowhere.yaml", "."])

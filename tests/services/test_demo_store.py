@@ -1,6 +1,10 @@
 """Demonstrations on disk: read back to the bit, readable with Minari, and never read when damaged."""
 
 import json
+import math
+import os
+import subprocess
+import threading
 from pathlib import Path
 
 import h5py
@@ -11,6 +15,7 @@ import pytest
 from dmil_core.configs import DemonstrationConfig, ExperimentConfig, SuiteConfig
 from dmil_core.demonstrations import DemonstrationError
 from services.demo_store import DemoStore, TaskDemonstrations
+from services.digests import write_listing
 from services.experiment import Experiment, open_runner
 from services.suites.base import Attempt
 
@@ -75,9 +80,16 @@ def flip_a_byte(path: Path) -> None:
     path.write_bytes(content)
 
 
-def forget_the_digest(path: Path) -> None:
+def reseal(folder: Path) -> None:
+    """Have the digests say that all is as it was written."""
+    write_listing(folder, "SHA256SUMS", ["data/main_data.hdf5", "data/metadata.json"])
+
+
+def change_metadata(path: Path, **changes: object) -> None:
     metadata = path.with_name("metadata.json")
-    metadata.write_text(json.dumps({k: v for k, v in json.loads(metadata.read_text()).items() if k != "digest"}))
+    found = {**json.loads(metadata.read_text()), **changes}
+    metadata.write_text(json.dumps({key: value for key, value in found.items() if value is not None}))
+    reseal(path.parents[1])
 
 
 @pytest.mark.parametrize(
@@ -89,18 +101,140 @@ def forget_the_digest(path: Path) -> None:
         lambda path: path.unlink(),
         lambda path: path.with_name("metadata.json").unlink(),
         lambda path: path.with_name("metadata.json").write_text("{"),
-        forget_the_digest,
+        lambda path: change_metadata(path, digest=None),
+        lambda path: change_metadata(path, total_episodes=4),
+        lambda path: change_metadata(path, failed=-1),
+        lambda path: (path.parents[1] / "SHA256SUMS").unlink(),
+        lambda path: (path.parents[1] / "SHA256SUMS").write_text(""),
+        lambda path: os.truncate(path, 10**13),
     ],
-    ids=["flipped byte", "truncated", "empty", "gone", "no metadata", "broken metadata", "no digest"],
+    ids=[
+        "flipped byte",
+        "truncated",
+        "empty",
+        "gone",
+        "no metadata",
+        "broken metadata",
+        "no digest",
+        "more episodes than there are",
+        "impossible metadata",
+        "no digests",
+        "empty digests",
+        "ten terabytes",
+    ],
 )
 @pytest.mark.usefixtures("saved")
 def test_a_damaged_data_set_is_refused_by_its_path(tmp_path: Path, harm):
-    folder = tmp_path / ID / "data"
-    harm(folder / "main_data.hdf5")
+    folder = tmp_path / ID
+    harm(folder / "data" / "main_data.hdf5")
     with pytest.raises(DemonstrationError) as error:
         DemoStore(tmp_path).load(ID, "reach")
     assert str(folder) in str(error.value)
     assert "collect again" in str(error.value)
+
+
+@pytest.mark.usefixtures("saved")
+def test_what_the_digests_do_not_vouch_for_never_reaches_the_hdf5_library(tmp_path: Path, monkeypatch):
+    flip_a_byte(tmp_path / ID / "data" / "main_data.hdf5")
+    monkeypatch.setattr(h5py, "File", lambda *_: pytest.fail("opened all the same"))
+    with pytest.raises(DemonstrationError, match="SHA-256"):
+        DemoStore(tmp_path).load(ID, "reach")
+
+
+@pytest.mark.usefixtures("saved")
+def test_sha256sum_checks_a_data_set(tmp_path: Path):
+    command = ["sha256sum", "--check", "--strict", "SHA256SUMS"]
+    assert subprocess.run(command, cwd=tmp_path / ID, capture_output=True).returncode == 0
+    flip_a_byte(tmp_path / ID / "data" / "main_data.hdf5")
+    assert subprocess.run(command, cwd=tmp_path / ID, capture_output=True).returncode == 1
+
+
+def put(name: str, value: np.ndarray):
+    def edit(file: h5py.File) -> None:
+        del file[name]
+        file[name] = value
+
+    return edit
+
+
+def link_out(file: h5py.File) -> None:
+    other = Path(file.filename).parents[3] / "other.hdf5"
+    with h5py.File(other, "w") as elsewhere:
+        elsewhere["secret"] = np.zeros((9, 2), np.float32)
+    del file["episode_1/actions"]
+    file["episode_1/actions"] = h5py.ExternalLink(str(other), "secret")
+
+
+def blow_up(file: h5py.File) -> None:
+    for name, shape in (("observations", (10**8 + 1, 5)), ("actions", (10**8, 2))):
+        del file[f"episode_1/{name}"]
+        file.create_dataset(f"episode_1/{name}", shape, "f4", compression="gzip")
+
+
+EDITS = {
+    "NaN": (put("episode_1/observations", np.full((10, 5), math.nan, np.float32)), "001 of reach: observations at"),
+    "infinite": (put("episode_1/actions", np.full((9, 2), math.inf, np.float32)), "001 of reach: actions at step 0"),
+    "double": (put("episode_1/actions", np.zeros((9, 2))), "episode_1/actions: got float64"),
+    "one axis": (put("episode_1/actions", np.zeros(9, np.float32)), "episode_1/actions: got float32 of the shape (9,)"),
+    "no step": (put("episode_0/actions", np.zeros((0, 2), np.float32)), "episode_0: got 5 observations of 0 actions"),
+    "id twice": (lambda file: file["episode_1"].attrs.__setitem__("id", 0), "episode_1: got the id 0; wanted 1"),
+    "outside": (link_out, "episode_1/actions: got no array of this file"),
+    "bomb": (blow_up, "got arrays of 2800000"),
+}
+
+
+@pytest.mark.parametrize(("edit", "words"), EDITS.values(), ids=EDITS)
+@pytest.mark.usefixtures("saved")
+def test_what_cannot_be_learned_from_is_refused_by_name(tmp_path: Path, edit, words: str):
+    with h5py.File(tmp_path / ID / "data" / "main_data.hdf5", "r+") as file:
+        edit(file)
+    reseal(tmp_path / ID)
+    with pytest.raises(DemonstrationError) as error:
+        DemoStore(tmp_path).load(ID, "reach")
+    assert str(tmp_path / ID) in str(error.value)
+    assert words in str(error.value)
+
+
+def test_a_demonstration_that_cannot_be_learned_from_is_not_written(attempts: list[Attempt], tmp_path: Path):
+    attempts[1].observations[3, 2] = math.nan
+    with pytest.raises(DemonstrationError, match="demonstration 001 of reach: observations at step 3 is not finite"):
+        DemoStore(tmp_path).save(ID, "reach", attempts, failed=0, settings={})
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("dataset_id", ["../other", "/etc", "link/x"])
+def test_a_data_set_lies_inside_the_root(tmp_path: Path, dataset_id: str):
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "link").symlink_to(tmp_path)
+    with pytest.raises(DemonstrationError, match="lies outside"):
+        DemoStore(root).load(dataset_id, "reach")
+    assert list(root.iterdir()) == [root / "link"]
+
+
+def test_whoever_is_slower_takes_what_the_faster_one_wrote(attempts: list[Attempt], tmp_path: Path, monkeypatch):
+    writers = threading.Barrier(2, timeout=20)
+    replace = Path.replace
+
+    def at_once(self: Path, target: Path) -> Path:
+        if self.name.startswith(".writing-"):
+            writers.wait()
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", at_once)
+    found: list[TaskDemonstrations] = []
+
+    def collect() -> None:
+        found.append(DemoStore(tmp_path).save(ID, "reach", attempts, failed=2, settings={}))
+
+    threads = [threading.Thread(target=collect) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [dataset.digest for dataset in found] == [found[0].digest] * 2
+    assert [path.name for path in tmp_path.iterdir()] == ["reach"]
+    assert DemoStore(tmp_path).load(ID, "reach") is not None
 
 
 def test_other_settings_other_id():

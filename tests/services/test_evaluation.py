@@ -8,7 +8,7 @@ import pytest
 from mlflow import MlflowClient
 
 from services.checkpoints import Checkpoints
-from services.results import AdaptationResult, EpisodeResult
+from services.results import AdaptationResult, EpisodeResult, read_rows
 
 SCHEDULE = (
     "--training.iterations", "6", "--training.checkpoint-every", "2", "--training.checkpoints-kept", "1",
@@ -22,11 +22,9 @@ WAYS = {
 
 
 def rows(folder: Path) -> list[EpisodeResult | AdaptationResult]:
-    """Return an evaluation's rows without the checkpoint's digest, which holds the id of the MLflow run."""
     return [
-        kind.model_validate_json(line).model_copy(update={"checkpoint": ""})
-        for kind, name in ((EpisodeResult, "episodes.jsonl"), (AdaptationResult, "adaptations.jsonl"))
-        for line in (folder / name).read_text().splitlines()
+        *read_rows(folder / "episodes.jsonl", EpisodeResult),
+        *read_rows(folder / "adaptations.jsonl", AdaptationResult),
     ]
 
 

@@ -7,6 +7,7 @@ import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from services.experiment import CollapseWatch, Experiment, open_runner
 from services.failures import read_failure
 from services.ray_runner import RayMetaTraining
 from services.results import EpisodeResult, write_rows
+from services.runners import LocalRunner
 from services.suites.base import Attempt
 from tests.services.conftest import QUICK_EVALUATION
 from tests.services.courses import ITERATIONS, alone, assert_same_bits, follow, plan_of, training
@@ -135,7 +137,7 @@ def nodes(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFact
     monkeypatch.setenv("RAY_TMPDIR", str(folder))
     settings = {"object_store_memory": 100_000_000, "include_dashboard": False}
     nodes = Nodes(initialize_head=True, head_node_args={"num_cpus": 2, **settings})
-    monkeypatch.setenv("RAY_ADDRESS", nodes.address)
+    monkeypatch.setenv("RAY_ADDRESS", str(nodes.address))
     yield nodes
     nodes.shutdown()
     subprocess.run(["rm", "-rf", str(folder)], check=True)
@@ -335,21 +337,34 @@ def test_a_collapse_is_told_once_when_it_has_lasted():
 # Evaluations on the way
 
 
-def test_an_evaluation_that_was_dropped_is_made_up(train, workplace: Path):
-    schedule = ("--training.checkpoint-every", "2", "--training.checkpoints-kept", "1", "--evaluation.every", "2")
-    train("whole", "--training.iterations", "6", *schedule)
-    train("parts", "--training.iterations", "4", *schedule)
-    made = workplace / "runs" / "parts" / "evaluations" / "0000002"
-    for path in made.iterdir():
+def test_evaluations_that_were_dropped_are_made_up(train, workplace: Path):
+    schedule = ("--training.checkpoint-every", "2", "--evaluation.every", "2")
+    train("run", "--training.iterations", "6", *schedule)
+    made = sorted((workplace / "runs" / "run" / "evaluations").rglob("*.jsonl"))
+    assert len(made) == 4
+    wanted = [path.read_bytes() for path in made]
+    for path in made:
         path.unlink()
-    made.rmdir()
-    # The run stopped at 4 iterations has no evaluation of those: they were the last.
-    train("parts", "--training.iterations", "6", *schedule, resume=True)
-    evaluations = workplace / "runs" / "parts" / "evaluations"
-    assert (evaluations / "0000004" / "episodes.jsonl").exists()
-    for path in evaluations.rglob("*.jsonl"):
-        twin = workplace / "runs" / "whole" / "evaluations" / path.relative_to(evaluations)
-        assert path.read_bytes() == twin.read_bytes()
+    train("run", resume=True)
+    assert [path.read_bytes() for path in made] == wanted
+
+
+def test_checkpoints_wait_for_their_evaluation(workplace: Path, train, monkeypatch: pytest.MonkeyPatch):
+    """However few are kept: else a run that is stopped could not make it up."""
+
+    class Never(NamedTuple):
+        def done(self) -> bool:
+            return False
+
+        def results(self) -> list:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(LocalRunner, "simulate_beside", lambda *given: Never())
+    schedule = ("--training.checkpoint-every", "1", "--training.checkpoints-kept", "1", "--evaluation.every", "2")
+    with pytest.raises(KeyboardInterrupt):
+        train("run", "--training.iterations", "6", *schedule)
+    checkpoints = Checkpoints(workplace / "runs" / "run" / "checkpoints", 1).all()
+    assert "iteration-0000002" in [path.name for path in checkpoints]
 
 
 # Full disks

@@ -1,5 +1,6 @@
 """The main program from end to end: what it leaves behind, and that stopping and going on changes no bit."""
 
+import hashlib
 import json
 import os
 import signal
@@ -126,7 +127,8 @@ def test_going_on_ends_with_the_same_bits(workplace: Path, train, mlflow_file: s
     history = client.get_metric_history(str(half.manifest.mlflow_run_id), "gradient_norm")
     assert [point.step for point in history] == list(range(1, 8))
     assert client.get_run(str(half.manifest.mlflow_run_id)).info.status == "FINISHED"
-    assert rows(workplace / "runs" / "parts")[0].success == rows(workplace / "runs" / "whole")[0].success
+    episodes = [(workplace / "runs" / name / "episodes.jsonl").read_bytes() for name in ("whole", "parts")]
+    assert episodes[0] == episodes[1], "also the checkpoint's digest"
 
 
 def test_a_run_that_was_stopped_before_its_first_checkpoint_begins_anew(workplace: Path, train):
@@ -229,6 +231,57 @@ def test_other_demonstrations_than_it_was_trained_on_are_refused(complaint, trai
     manifest = train("run", "--training.iterations", "1").path / "manifest.json"
     was = json.loads(manifest.read_text())
     manifest.write_text(json.dumps(was | {"data": was["data"] | {"push": "0" * 64}}))
+    digest = hashlib.sha256(manifest.read_bytes()).hexdigest()
+    manifest.with_name("manifest.sha256").write_text(f"{digest}  manifest.json\n")
     printed = complaint(meta_train.run, "--resume", "run", "--training.iterations", "2", "--runner", "local")
     assert "trained on other demonstrations of push" in printed
     assert "DMIL_DATA" in printed
+
+
+@pytest.mark.usefixtures("workplace")
+@pytest.mark.parametrize("name", ["..", ".", "../run", "a/b", "/tmp/run", "run/"])
+def test_a_run_stays_inside_the_folder_of_runs(complaint, name: str):
+    printed = complaint(meta_train.run, "--preset", "ml10-smoke", "--name", name)
+    assert f"--name: got '{name}'; wanted the name of a folder in runs" in printed
+    assert not Path("runs").exists()
+
+
+def test_a_link_out_of_the_folder_of_runs_is_not_followed(complaint, train):
+    train("run", "--training.iterations", "0")
+    Path("runs/run").rename("elsewhere")
+    Path("runs/run").symlink_to("../elsewhere")
+    before = sorted(Path("elsewhere").rglob("*"))
+    for arguments in (("--resume", "run"), ("--resume", "runs/run"), ("--preset", "ml10-smoke", "--name", "run")):
+        assert "got runs/run, a link out of runs" in complaint(meta_train.run, *arguments)
+    assert sorted(Path("elsewhere").rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "settings: got "),
+        ("{}x", "settings: got "),
+        ('{"seed": -1}', "seed: got -1"),
+        ("[" * 9**5, "settings: got "),
+    ],
+    ids=["empty", "no JSON", "impossible", "deep"],
+)
+def test_a_damaged_config_of_a_run_is_named(complaint, train, text: str, words: str):
+    train("run", "--training.iterations", "0")
+    Path("runs/run/config.json").write_text(text)
+    printed = complaint(meta_train.run, "--resume", "run")
+    assert "runs/run/config.json: " + words in printed
+    assert len(printed) < 500
+
+
+def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_it_used(train, capsys):
+    undisturbed = train("whole", "--training.iterations", "7")
+    newest = train("parts", "--training.iterations", "4", "--training.checkpoint-every", "2").path
+    damaged = newest / "parameters.safetensors"
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    capsys.readouterr()
+    resumed = train("parts", "--training.iterations", "7", resume=True)
+    (warning,) = [line for line in capsys.readouterr().out.splitlines() if damaged.name in line]
+    assert warning.startswith("warning: runs/parts/checkpoints/iteration-0000004/parameters.safetensors: got ")
+    assert warning.endswith("taking runs/parts/checkpoints/iteration-0000002 instead")
+    assert same(resumed, undisturbed)

@@ -1,7 +1,10 @@
 import json
 from pathlib import Path
 
+import pytest
+
 from services.report import draw_curves, read_metrics
+from services.results import RowError
 
 
 def spool(folder: Path, *records: tuple[str, object]) -> None:
@@ -15,6 +18,27 @@ def metrics(step: int, **values: float) -> tuple[str, object]:
 def test_metrics_are_read_in_order_and_an_iteration_done_again_counts_once(tmp_path: Path) -> None:
     spool(tmp_path, ("tags", {}), metrics(2, agreement=0.5), metrics(1, agreement=0.1), metrics(2, agreement=0.7))
     assert read_metrics(tmp_path) == [{"iteration": 1, "agreement": 0.1}, {"iteration": 2, "agreement": 0.7}]
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('["metrics", {"step": 1, "val', "got half a line"),
+        ("\n", "record: got b''"),
+        ('{"step": 1}\n', "got {'step': 1}"),
+        ('["metrics", {"step": "1", "values": {}}]\n', "step: got '1'"),
+        ('["metrics", {"step": 1, "values": {"agreement": "high"}}]\n', "values.agreement: got 'high'"),
+    ],
+)
+def test_a_damaged_record_is_refused_by_file_and_line(tmp_path: Path, line: str, words: str) -> None:
+    spool(tmp_path, metrics(1, agreement=float("nan")))
+    assert len(read_metrics(tmp_path)) == 1
+    with (tmp_path / "tracking.jsonl").open("a") as file:
+        file.write(line)
+    with pytest.raises(RowError) as error:
+        read_metrics(tmp_path)
+    assert f"{tmp_path / 'tracking.jsonl'}:2: " in str(error.value)
+    assert words in str(error.value)
 
 
 def test_a_folder_without_records_has_no_metrics(tmp_path: Path) -> None:

@@ -75,6 +75,20 @@ def test_task_gradient_hands_the_four_sets_on_in_order(method, demonstrations) -
     assert not torch.equal(got.gradient, swapped.gradient)
 
 
+@pytest.mark.parametrize("order", ["first", "second"])
+def test_a_single_step_can_be_learned_from(make_demonstrations, order: Literal["first", "second"]) -> None:
+    demonstrations = make_demonstrations(0, [1] * 8)
+    settings = SMALL.model_copy(update={"order": order, "continuity_weight": 0.1})
+    method = Dmil(settings, action_dim=3, standardise=Standardisation.of(demonstrations))
+    parameters = method.initial_parameters(stream(0, "initial"))
+    found = method.task_gradient(parameters, method.sample(demonstrations, stream(0, "batch")))
+    assert torch.isfinite(found.gradient).all()
+    assert found.gradient.any()
+    assert all(np.isfinite(value) for value in found.metrics.values())
+    policy = method.adapt(parameters, demonstrations[:1], FineTuning(steps=2, learning_rate=0.05))
+    assert torch.isfinite(flatten(policy.hierarchy.parameters)).all()
+
+
 def test_the_chosen_sub_skill_acts(method, demonstrations, plain_mlp) -> None:
     parameters = method.initial_parameters(stream(1, "initial"))
     policy = method.adapt(parameters, demonstrations[:2], FineTuning(steps=2, learning_rate=0.05))
