@@ -30,7 +30,7 @@ __all__ = ["FAN_IN", "RayMetaTraining", "RayRunner"]
 OBJECT_STORE_BYTES = 500_000_000
 FAN_IN = 8
 """Gradients that one worker adds at a time, a power of two; it does not change the result."""
-LOSSES_ALLOWED = 3
+LOSSES_ALLOWED = 10
 """So often may the learner, or a result that others build upon, be lost without an iteration more done."""
 POLITENESS = 10
 """How far a simulation beside meta-training stands back, see `os.nice`."""
@@ -346,8 +346,13 @@ class RayMetaTraining:
         self._pool.retry(call)
 
     def _start_learner(self) -> None:
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        here = NodeAffinitySchedulingStrategy(self._ray.get_runtime_context().get_node_id(), soft=True)
         # Out of order, so that the state can be had while a step waits for its gradients. One step waits at a time.
-        learner: Any = self._ray.remote(num_cpus=0)(Learner).options(allow_out_of_order_execution=True)
+        learner: Any = self._ray.remote(num_cpus=0, scheduling_strategy=here)(Learner).options(
+            allow_out_of_order_execution=True
+        )
         self._learner = learner.remote(self._kept, self._plan.settings, skip_nonfinite=self._plan.skip_nonfinite)
 
     def _resume(self) -> None:
@@ -357,17 +362,20 @@ class RayMetaTraining:
 
     def _recover(self, error: LostError) -> None:
         """Begin the lost iterations again, from the learner's state, or that of another learner in its place."""
-        self._losses[self._told] += 1
-        if self._losses[self._told] > LOSSES_ALLOWED:
-            raise error
-        self._pool.drop()
-        self._ahead = None
-        try:
-            self._kept = self._pool.result(self._pool.submit("state", on=self._learner))
-            self._resume()
-        except LostError:
-            self._start_learner()
-            self._resume()
+        lost = error
+        while True:
+            self._losses[self._told] += 1
+            if self._losses[self._told] > LOSSES_ALLOWED:
+                raise lost
+            self._pool.drop()
+            self._ahead = None
+            try:
+                self._kept = self._pool.result(self._pool.submit("state", on=self._learner))
+                self._resume()
+                break
+            except LostError as again:
+                lost = again
+                self._start_learner()
         self._done = self._kept.iteration
         console.print(f"{error}; going on from the state after iteration {self._done}")
 

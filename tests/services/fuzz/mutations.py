@@ -1,12 +1,17 @@
 """Mutations of bytes and of what JSON and YAML can say."""
 
 import copy
+import json
 import math
 from collections.abc import Callable
+from functools import partial
 from random import Random
 from typing import Any
 
 from hypothesis import strategies
+
+Odd = Callable[[], Any]
+"""Draws a value that no reader expects."""
 
 DEEP: Any = 0
 for _ in range(60):
@@ -52,7 +57,7 @@ def mutated_bytes(content: bytes, draw: Random) -> bytes:
     return bytes(mutated)
 
 
-def mutated_value(value: Any, draw: Random, odd: Callable[[], Any]) -> Any:
+def mutated_value(value: Any, draw: Random, odd: Odd) -> Any:
     """Return a copy of what JSON can say, with a field replaced, removed, renamed, added or swapped with another."""
     mutated = copy.deepcopy(value)
     places = list(_places(mutated))
@@ -85,3 +90,12 @@ def _places(value: Any) -> Any:
         for key in list(value) if isinstance(value, dict) else range(len(value)):
             yield value, key
             yield from _places(value[key])
+
+
+def plain_odd(draw: Random) -> Odd:
+    """Return what draws from the fixed list of odd values."""
+    return partial(draw.choice, ODD)
+
+
+def json_bytes(value: Any) -> bytes:
+    return json.dumps(value).encode()

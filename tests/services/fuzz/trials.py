@@ -15,8 +15,8 @@ from random import Random
 from guards import guarded, set_up
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis.strategies import DataObject, data, randoms
-from mutations import json_values
-from readers import READERS, Odd, Reader, plain_odd
+from mutations import Odd, json_values, plain_odd
+from readers import READERS, Reader
 
 from dmil_core.errors import UserError
 
