@@ -1,0 +1,246 @@
+"""A campaign of kills: quick experiments whose processes are killed at random moments, against an undisturbed one.
+
+Workers (one, or all at once), the learner and the program itself are killed with SIGKILL; a killed program is resumed.
+In the end, parameters, Adam's moments and all result rows are compared to the bit with those of the undisturbed run.
+What a kill of each kind cost is estimated from the runs' seconds by least squares.
+"""
+
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import psutil
+from rich.box import SIMPLE
+from rich.table import Table
+from scipy.optimize import nnls
+
+from services.command_line import exit_code, parse
+from services.progress import Bar, console
+
+__all__ = ["Arguments", "run"]
+
+VICTIMS = {"worker": 6, "all workers": 1, "learner": 2, "driver": 2}
+"""What is killed, and how often against the others."""
+KILLS_PER_RUN = 8
+SETTINGS = (
+    "--preset", "ml10-smoke", "--workers", "2", "--training.iterations", "600", "--training.checkpoint-every", "50",
+    "--training.tasks-per-iteration", "6", "--evaluation.every", "200", "--method.hidden-units", "64",
+)  # fmt: skip
+SECONDS_BETWEEN = 3.0
+"""Mean time from one kill to the next."""
+RUN_SECONDS = 600.0
+"""A run that takes longer counts as lost."""
+ATTEMPTS = 3
+"""So often may a program end with an error of its own, and be resumed, before its run counts as lost."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Arguments of ``faults``."""
+
+    kills: int = 200
+    """How many processes, or groups of them at once, are killed in all."""
+    seed: int = 0
+    """Of the moments and the victims."""
+    folder: Path | None = None
+    """Keep demonstrations and runs here; else they go when all is over."""
+    json: Path | None = None
+    """File for the result."""
+
+
+class Outcome(NamedTuple):
+    """What came of one disturbed run."""
+
+    kills: Counter[str]
+    seconds: float
+    found: str | None
+    """Digest of what it ended with; none if it did not end."""
+
+
+class Campaign:
+    """Runs of one experiment in one folder."""
+
+    def __init__(self, folder: Path, draw: random.Random) -> None:
+        """Run in `folder`, where all runs share their demonstrations."""
+        self.folder, self._draw = folder, draw
+        self._environment = os.environ | {"MLFLOW_TRACKING_URI": f"sqlite:///{folder / 'mlflow.db'}"}
+        self._environment.pop("RAY_ADDRESS", None)
+        self._environment["PYTHONPATH"] = str(Path(__file__).parents[1])
+
+    def run(self, name: str, kills: int) -> Outcome:
+        """Run the experiment, killing something of it so many times unless it ends before."""
+        began, done, errors = time.monotonic(), Counter[str](), 0
+        log = (self.folder / f"{name}.log").open("w")
+        program = self._start(name, log)
+        try:
+            while time.monotonic() - began < RUN_SECONDS:
+                pause = self._draw.expovariate(1 / SECONDS_BETWEEN) if done.total() < kills else RUN_SECONDS
+                if not _ended(program, pause):
+                    if victim := self._kill(program):
+                        done[victim] += 1
+                elif program.returncode == 0:
+                    return Outcome(done, time.monotonic() - began, outcome_digest(self.folder / "runs" / name))
+                else:
+                    if program.returncode != -signal.SIGKILL:
+                        errors += 1
+                    if errors == ATTEMPTS:
+                        break
+                    program = self._start(name, log)
+            return Outcome(done, time.monotonic() - began, None)
+        finally:
+            _kill([program, *_descendants(program)])
+            log.close()
+
+    def _start(self, name: str, log: Any) -> psutil.Popen:
+        begun = (self.folder / "runs" / name / "config.json").exists()
+        which = ["--resume", name] if begun else ["--name", name, *SETTINGS]
+        command = [sys.executable, "-m", "services.meta_train", *which]
+        return psutil.Popen(
+            command,
+            cwd=self.folder,
+            env=self._environment,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+
+    def _kill(self, program: psutil.Popen) -> str | None:
+        """Kill a random one of those that there are; return what it was."""
+        titles = {process: _title(process) for process in _descendants(program)}
+        workers = [p for p, title in titles.items() if "Worker" in title and title.startswith("ray::")]
+        learners = [p for p, title in titles.items() if title.startswith("ray::Learner")]
+        there: dict[str, list[Any]] = {"worker": workers[:], "learner": learners, "driver": [program]}
+        there["all workers"] = workers if len(workers) > 1 else []
+        kinds = [kind for kind in VICTIMS if there[kind]]
+        kind = self._draw.choices(kinds, [VICTIMS[kind] for kind in kinds])[0]
+        if kind == "driver":
+            left = _descendants(program)
+            _kill([program])
+            _, alive = psutil.wait_procs(left, timeout=20)  # a new program must not meet the old one's processes
+            _kill(alive)
+        else:
+            _kill([self._draw.choice(there[kind])] if kind == "worker" else there[kind])
+        return kind
+
+
+def outcome_digest(run: Path) -> str:
+    """Return the SHA-256 of a run's last parameters, optimiser state and rows, those of evaluations on the way too."""
+    last = max((run / "checkpoints").glob("iteration-*"))
+    files = [last / "parameters.safetensors", last / "optimiser.safetensors", *sorted(run.rglob("*.jsonl"))]
+    sha = hashlib.sha256(last.name.encode())
+    for file in files:
+        if file.name != "tracking.jsonl":
+            sha.update(str(file.relative_to(run)).encode() + hashlib.sha256(file.read_bytes()).digest())
+    return sha.hexdigest()
+
+
+def _ended(program: psutil.Popen, seconds: float) -> bool:
+    try:
+        program.wait(seconds)
+    except psutil.TimeoutExpired:
+        return False
+    return True
+
+
+def _descendants(program: psutil.Popen) -> list[psutil.Process]:
+    try:
+        return program.children(recursive=True)
+    except psutil.NoSuchProcess:
+        return []
+
+
+def _title(process: psutil.Process) -> str:
+    try:
+        return " ".join(process.cmdline())
+    except psutil.Error:
+        return ""
+
+
+def _kill(processes: Sequence[Any]) -> None:
+    for process in processes:
+        try:
+            process.kill()
+        except psutil.NoSuchProcess:
+            continue
+
+
+def _costs(outcomes: Sequence[Outcome], undisturbed: float) -> dict[str, float]:
+    """Return the seconds that a kill of each kind cost, which add up to those that the runs took longer."""
+    counts = np.array([[outcome.kills[kind] for kind in VICTIMS] for outcome in outcomes], float)
+    longer = np.array([outcome.seconds - undisturbed for outcome in outcomes])
+    seconds, _ = nnls(counts, np.maximum(longer, 0))
+    return dict(zip(VICTIMS, map(float, seconds), strict=True))
+
+
+def _table(outcomes: Sequence[Outcome], wanted: str | None, costs: dict[str, float]) -> Table:
+    view = Table(title="Kills, by what became of the runs that they struck", box=SIMPLE)
+    for column in ("killed", "kills", "survived", "lost", "different", "seconds each cost"):
+        view.add_column(column, justify="left" if column == "killed" else "right")
+    for kind in (*VICTIMS, "all"):
+        parts = _counts(outcomes, wanted, kind)
+        cost = f"{costs[kind]:.1f}" if kind in costs else ""
+        view.add_row(
+            kind, str(sum(parts.values())), *(str(parts[name]) for name in ("equal", "lost", "different")), cost
+        )
+    return view
+
+
+def _counts(outcomes: Sequence[Outcome], wanted: str | None, kind: str = "all") -> Counter[str]:
+    found: Counter[str] = Counter()
+    for outcome in outcomes:
+        became = "lost" if outcome.found is None else "equal" if outcome.found == wanted else "different"
+        found[became] += outcome.kills.total() if kind == "all" else outcome.kills[kind]
+    return found
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run the benchmark."""
+    given = parse(Arguments, __doc__ or "", arguments, Arguments())
+    folder = given.folder or Path(tempfile.mkdtemp(prefix="dmil-faults-"))
+    folder.mkdir(parents=True, exist_ok=True)
+    campaign = Campaign(folder.resolve(), random.Random(given.seed))
+    try:
+        campaign.run("collecting", 0)
+        undisturbed = campaign.run("undisturbed", 0)
+        outcomes: list[Outcome] = []
+        with Bar("kills", given.kills) as bar:
+            while (done := sum(outcome.kills.total() for outcome in outcomes)) < given.kills:
+                outcome = campaign.run(f"run-{len(outcomes):03d}", min(KILLS_PER_RUN, given.kills - done))
+                outcomes.append(outcome)
+                bar.advance(outcome.kills.total(), f"{len(outcomes)} runs, {_counts(outcomes, undisturbed.found)}")
+    finally:
+        if given.folder is None:
+            shutil.rmtree(folder, ignore_errors=True)
+    counts = _counts(outcomes, undisturbed.found)
+    costs = _costs(outcomes, undisturbed.seconds)
+    console.print(_table(outcomes, undisturbed.found, costs))
+    console.print(
+        f"{len(outcomes)} runs of {undisturbed.seconds:.0f} s undisturbed; {counts['equal']} of {counts.total()} kills "
+        "struck runs that ended with the same bits"
+    )
+    if given.json is not None:
+        row = {"kills": counts.total(), **{name: counts[name] for name in ("equal", "lost", "different")}}
+        write_result(given.json, row | {"runs": len(outcomes), "seconds": undisturbed.seconds, "cost": costs})
+
+
+def write_result(path: Path, result: dict[str, Any]) -> None:
+    """Write the result as a JSON object."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(run, sys.argv[1:]))
