@@ -1,6 +1,5 @@
 """What a run shows at its end: the table on the terminal, and its report folder with tables and plots."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,7 +12,8 @@ from matplotlib.axes import Axes
 from services.checkpoints import Checkpoint
 from services.progress import console
 from services.summary import Summary, rates, table, table_markdown, write_summary
-from services.tracking import Tracker
+from services.tracking import Tracker, redacted
+from services.tracking.spool import Measured, read_spool
 
 __all__ = ["draw_curves", "publish", "read_metrics", "show", "write_report"]
 
@@ -32,15 +32,15 @@ SMOOTHED = 50
 
 
 def read_metrics(folder: Path) -> list[dict[str, float]]:
-    """Return the metrics of each iteration from a run's ``tracking.jsonl``; an iteration done again counts once."""
-    path = folder / "tracking.jsonl"
-    if not path.exists():
-        return []
+    """Return the metrics of each iteration from a run's ``tracking.jsonl``; an iteration done again counts once.
+
+    Raises:
+        SpoolError: names the line that is damaged.
+    """
     by_step: dict[int, dict[str, float]] = {}
-    with path.open() as file:
-        for kind, value in map(json.loads, file):
-            if kind == "metrics":
-                by_step.setdefault(value["step"], {"iteration": value["step"]}).update(value["values"])
+    for line in read_spool(folder / "tracking.jsonl"):
+        if isinstance(line.value, Measured):
+            by_step.setdefault(line.value.step, {"iteration": line.value.step}).update(line.value.values)
     return [by_step[step] for step in sorted(by_step)]
 
 
@@ -80,7 +80,7 @@ def publish(tracker: Tracker, summary: Summary, folder: Path) -> None:
     """Record the success rates, of each task and in all, the report and the checkpoint on the MLflow run."""
     metrics = rates(summary.rows, summary.sub_skills)
     metrics |= {f"seconds/{phase}": spent for phase, spent in summary.seconds.items()}
-    tracker.metrics(Checkpoint(Path(summary.checkpoint)).manifest.iteration, metrics)
+    tracker.metrics(Checkpoint(Path(summary.checkpoint)).manifest.iteration, metrics, anew=True)
     tracker.tags({"mlflow.note.content": table_markdown(summary)})
     for path, destination in (
         (folder / "report", "report"),
@@ -110,6 +110,6 @@ def show(summary: Summary, tracking_uri: str | None = None) -> None:
     console.print("seconds: " + ", ".join(f"{phase} {spent:.0f}" for phase, spent in summary.seconds.items()))
     console.print(f"checkpoint: {summary.checkpoint}\nreport: {summary.report}")
     if tracking_uri is not None:
-        console.print(f"MLflow run: {summary.mlflow_run_id or 'not there yet'} at {tracking_uri}")
+        console.print(f"MLflow run: {summary.mlflow_run_id or 'not there yet'} at {redacted(tracking_uri)}")
         if tracking_uri.startswith("sqlite"):
             console.print(f"to look at it: mlflow ui --backend-store-uri {tracking_uri} --host 127.0.0.1")
