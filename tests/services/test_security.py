@@ -66,6 +66,20 @@ def test_loopback_is_told_from_the_rest(address: str, wanted: bool):
     assert on_loopback(address) == wanted
 
 
+@pytest.mark.slow
+def test_a_cluster_as_the_readme_starts_it_listens_on_loopback(cluster):
+    port = int(cluster.address.rpartition(":")[2])
+    head = next(
+        process.parent()
+        for process in psutil.process_iter()
+        if process.name() == "gcs_server" and any(link.laddr.port == port for link in process.net_connections("inet"))
+    )
+    assert head is not None
+    found = listening(head.pid)
+    assert len(found) > 0
+    assert {address: who for address, who in found.items() if not on_loopback(address)} == {}
+
+
 FAILS = """
 import sys
 from services import meta_train
