@@ -4,7 +4,7 @@ BIN := .venv/bin
 INSTALLED := .venv/installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test clean
+.PHONY: help setup train test audit clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z]*\):[^#]*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -32,6 +32,13 @@ test: setup ## lint, format, types, then every test
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
 	$(BIN)/python -m pytest
+
+audit: setup ## ask PyPI for known vulnerabilities of every pinned dependency; options go in ARGS, as ARGS="-s osv"
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[audit]'
+	@$(BIN)/python -m pip_audit --strict --disable-pip --no-deps --progress-spinner off -r constraints.txt $(ARGS) || \
+		{ echo "audit: not passed: a dependency has a known vulnerability, or, where it says that one could not be" \
+			"audited or a connection failed, nothing is known: it needs https://pypi.org/pypi, with ARGS=\"-s osv\"" \
+			"https://api.osv.dev"; exit 1; }
 
 clean: ## remove .venv, caches and builds; data/ and runs/ stay
 	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache .hypothesis

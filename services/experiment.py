@@ -255,7 +255,7 @@ class Experiment:
                 shapes={name: tuple(shape) for name, shape in shapes.items()},
                 data=digests,
                 versions=library_versions(),
-                mlflow_run_id=tracker.identify(),
+                mlflow_run_id=tracker.identify(patience=20.0 if state.iteration == settings.iterations else 0.0),
             )
             arrays = {name: tensor.numpy() for name, tensor in parameters.items()}
             return checkpoints.save(state, arrays, method.constants(), manifest)

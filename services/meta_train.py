@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -68,7 +69,7 @@ def run(arguments: Sequence[str]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     write_file(folder / "config.json", config.model_dump_json(indent=1) + "\n")
     console.print(f"run: {folder}")
-    tracker = Tracker(folder, f"dmil-{config.suite.name}", console.print)
+    tracker = Tracker(folder, f"dmil-{config.suite.name}", partial(console.print, markup=False))
     status = "FAILED"
     try:
         introduce(tracker, config)
@@ -98,8 +99,7 @@ def run(arguments: Sequence[str]) -> None:
         console.print(f"stopped; to go on: python -m services.meta_train --resume {folder}")
         raise
     finally:
-        if not tracker.close(status):
-            console.print(f"MLflow records that are not delivered wait in {folder / 'tracking.jsonl'}")
+        tracker.close(status)
     show(summary, tracker.uri)
 
 

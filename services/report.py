@@ -2,21 +2,18 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
 
 import matplotlib
 
 matplotlib.use("Agg")
 from matplotlib import pyplot
 from matplotlib.axes import Axes
-from pydantic import BaseModel, Field, RootModel, ValidationError
 
-from dmil_core.errors import explain
 from services.checkpoints import Checkpoint
 from services.progress import console
-from services.results import RowError, read_lines
 from services.summary import AGAINST_COLLAPSE, COLLAPSED, Summary, rates, table, table_markdown, write_summary
-from services.tracking import Tracker
+from services.tracking import Tracker, redacted
+from services.tracking.spool import Measured, read_spool
 
 __all__ = ["draw_curves", "publish", "read_metrics", "show", "write_report"]
 
@@ -32,34 +29,16 @@ SMOOTHED = 50
 """A curve is drawn through so many means at most."""
 
 
-class _Metrics(BaseModel):
-    step: Annotated[int, Field(ge=0, lt=2**63)]
-    values: dict[str, float]
-
-
-class _Record(RootModel[tuple[str, Any]]):
-    """One line of ``tracking.jsonl``."""
-
-
 def read_metrics(folder: Path) -> list[dict[str, float]]:
     """Return the metrics of each iteration from a run's ``tracking.jsonl``; an iteration done again counts once.
 
     Raises:
-        RowError: names the file and the line that is not as the tracker writes it.
+        SpoolError: names the line that is damaged.
     """
-    path = folder / "tracking.jsonl"
-    if not path.exists():
-        return []
     by_step: dict[int, dict[str, float]] = {}
-    for number, line in read_lines(path):
-        try:
-            kind, value = _Record.model_validate_json(line).root
-            if kind == "metrics":
-                found = _Metrics.model_validate(value, strict=True)
-                by_step.setdefault(found.step, {"iteration": found.step}).update(found.values)
-        except ValidationError as error:
-            got = "; ".join(explain(error, "record").splitlines())
-            raise RowError(f"{path}:{number}: {got}; wanted a whole record; remove the line") from error
+    for line in read_spool(folder / "tracking.jsonl"):
+        if isinstance(line.value, Measured):
+            by_step.setdefault(line.value.step, {"iteration": line.value.step}).update(line.value.values)
     return [by_step[step] for step in sorted(by_step)]
 
 
@@ -99,7 +78,7 @@ def publish(tracker: Tracker, summary: Summary, folder: Path) -> None:
     """Record the success rates, of each task and in all, the report and the checkpoint on the MLflow run."""
     metrics = rates(summary.rows, summary.sub_skills)
     metrics |= {f"seconds/{phase}": spent for phase, spent in summary.seconds.items()}
-    tracker.metrics(Checkpoint(Path(summary.checkpoint)).manifest.iteration, metrics)
+    tracker.metrics(Checkpoint(Path(summary.checkpoint)).manifest.iteration, metrics, anew=True)
     tracker.tags({"mlflow.note.content": table_markdown(summary)})
     for path, destination in (
         (folder / "report", "report"),
@@ -128,6 +107,6 @@ def show(summary: Summary, tracking_uri: str | None = None) -> None:
     console.print("seconds: " + ", ".join(f"{phase} {spent:.0f}" for phase, spent in summary.seconds.items()))
     console.print(f"checkpoint: {summary.checkpoint}\nreport: {summary.report}")
     if tracking_uri is not None:
-        console.print(f"MLflow run: {summary.mlflow_run_id or 'not there yet'} at {tracking_uri}")
+        console.print(f"MLflow run: {summary.mlflow_run_id or 'not there yet'} at {redacted(tracking_uri)}")
         if tracking_uri.startswith("sqlite"):
             console.print(f"to look at it: mlflow ui --backend-store-uri {tracking_uri} --host 127.0.0.1")

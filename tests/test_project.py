@@ -7,34 +7,79 @@ from pathlib import Path
 import pytest
 
 PROJECT = Path(__file__).parents[1]
+PRUNED = {"build", "dist", "data", "runs"}
 FILES = [
-    path for package in ("dmil_core", "services", "benchmarks") for path in sorted((PROJECT / package).rglob("*.py"))
+    path
+    for path in sorted(PROJECT.rglob("*.py"))
+    if not any(part.startswith(".") or part in PRUNED for part in path.relative_to(PROJECT).parts[:-1])
 ]
 
 UNPICKLING_MODULES = {"pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve"}
-UNPICKLING_CALLS = {"torch.load", "yaml.load", "yaml.unsafe_load", "yaml.full_load", "pandas.read_pickle"}
+UNPICKLING_CALLS = {
+    "torch.load", "torch.serialization.load", "yaml.load", "yaml.load_all", "yaml.unsafe_load", "yaml.unsafe_load_all",
+    "yaml.full_load", "yaml.full_load_all", "pandas.read_pickle",
+}  # fmt: skip
+USUAL_ALIASES = {"np": "numpy", "pd": "pandas"}
 VAGUE_NAMES = {"utils.py", "util.py", "helpers.py", "helper.py", "common.py", "misc.py"}
+
+
+def full_names(tree: ast.AST) -> dict[str, str]:
+    """Return what the names that a file imports stand for: with `import torch as t`, t stands for torch."""
+    names = dict(USUAL_ALIASES)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.asname: alias.name for alias in node.names if alias.asname}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+    return names
 
 
 def unpickling(source: str) -> Iterator[str]:
     """Yield what could run code out of a file that is read."""
-    for node in ast.walk(ast.parse(source)):
+    tree = ast.parse(source)
+    names = full_names(tree)
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name.partition(".")[0] in UNPICKLING_MODULES)
         elif isinstance(node, ast.ImportFrom) and node.module:
-            names = {f"{node.module}.{alias.name}" for alias in node.names}
-            yield from names & UNPICKLING_CALLS
+            imported = {f"{node.module}.{alias.name}" for alias in node.names}
+            yield from imported & UNPICKLING_CALLS
             if node.module.partition(".")[0] in UNPICKLING_MODULES:
                 yield node.module
-        elif isinstance(node, ast.Attribute) and (call := ast.unparse(node)) in UNPICKLING_CALLS:
-            yield call
+            else:
+                yield from (name for name in imported if name.rpartition(".")[2] in UNPICKLING_MODULES)
+        elif isinstance(node, ast.Attribute):
+            first, dot, rest = ast.unparse(node).partition(".")
+            if (call := names.get(first, first) + dot + rest) in UNPICKLING_CALLS:
+                yield call
         elif isinstance(node, ast.keyword) and node.arg == "allow_pickle" and ast.unparse(node.value) != "False":
             yield ast.unparse(node)
+        elif isinstance(node, ast.Call):
+            yield from unpickling_call(node, names)
+
+
+def unpickling_call(node: ast.Call, names: dict[str, str]) -> Iterator[str]:
+    """Yield a call that would unpickle without the word: by position, by name or out of a dictionary of arguments."""
+    words = [argument.value for argument in node.args if isinstance(argument, ast.Constant)]
+    first, dot, rest = ast.unparse(node.func).partition(".")
+    called = names.get(first, first) + dot + rest
+    if called == "numpy.load" and len(node.args) > 2:  # the third is allow_pickle
+        yield ast.unparse(node)
+    if called in {"__import__", "importlib.import_module"} and UNPICKLING_MODULES & set(words):
+        yield ast.unparse(node)
+    if any(keyword.arg is None and "allow_pickle" in ast.unparse(keyword.value) for keyword in node.keywords):
+        yield ast.unparse(node)
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PROJECT)))
 def test_nothing_is_unpickled(path: Path):
     assert list(unpickling(path.read_text("utf-8"))) == []
+
+
+def test_the_whole_tree_is_looked_at():
+    places = {path.relative_to(PROJECT).parts[0] for path in FILES}
+    assert places >= {"dmil_core", "services", "benchmarks", "tests"}
+    assert Path(__file__) in FILES
 
 
 def test_a_name_says_what_is_in_the_file():
@@ -48,6 +93,23 @@ def test_a_name_says_what_is_in_the_file():
         "from pickle import loads",
         "weights = torch.load(path)",
         "from torch import load",
+        "from torch import load as read",
+        "import torch as t\nt.load(path)",
+        "from torch import serialization as s\ns.load(path)",
+        "import torch.serialization as s\ns.load(path)",
+        "from numpy import load\nload(path, allow_pickle=True)",
+        "from numpy import load as read\nread(path, None, True)",
+        "np.load(path, None, True)",
+        "np.load(path, **{'allow_pickle': True})",
+        "import joblib",
+        "import joblib as j",
+        "from joblib import load",
+        "from pandas.io import pickle",
+        "import pandas as p\np.read_pickle(path)",
+        "import yaml as y\ny.load(text, y.Loader)",
+        "from yaml import unsafe_load",
+        "__import__('pickle')",
+        "from importlib import import_module\nimport_module('dill')",
         "numpy.load(path, allow_pickle=True)",
         "numpy.load(path, allow_pickle=trusted)",
         "yaml.load(text, Loader=yaml.SafeLoader)",
@@ -57,6 +119,15 @@ def test_unpickling_is_found(source: str):
     assert len(list(unpickling(source))) == 1
 
 
-@pytest.mark.parametrize("source", ["numpy.load(path, allow_pickle=False)", "yaml.safe_load(text)", "'''No pickle.'''"])
+@pytest.mark.parametrize(
+    "source",
+    [
+        "numpy.load(path, allow_pickle=False)",
+        "from numpy import load\nload(path)",
+        "yaml.safe_load(text)",
+        "from json import load\nload(file)",
+        "'''No pickle.'''",
+    ],
+)
 def test_safe_reading_is_let_through(source: str):
     assert list(unpickling(source)) == []

@@ -1,0 +1,197 @@
+"""What tracking costs meta-training: none, MLflow not there, MLflow slow, MLflow taking records into SQLite.
+
+Four runs of the quick size, with made-up demonstrations as in `benchmarks.scaling`, take turns in this process. The
+trackers' threads work beside. Each is opened and has asked MLflow for the first time before anything is measured; then
+the slow server waits ten seconds before each answer. Ratios are medians over rounds, each against the turn without
+tracking of the same round.
+"""
+
+import os
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from rich.box import SIMPLE
+from rich.table import Table
+
+from benchmarks.scaling import made_up_plan
+from benchmarks.timing import alternate, write_rows
+from services.command_line import exit_code, parse
+from services.progress import console
+from services.runners import Iteration, LocalMetaTraining
+from services.tracking import Tracker
+from services.tracking.delivery import Identity
+from services.tracking.spool import read_spool
+
+__all__ = ["Arguments", "run"]
+
+DELAY = 10.0
+"""Seconds that the slow server waits before each answer."""
+LEAST = 0.95
+"""Of the speed without tracking."""
+WARM_UP = 3
+NONE = "no tracking"
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Arguments of ``tracking``."""
+
+    rounds: int = 8
+    """Turns that each takes."""
+    iterations: int = 60
+    """Of one turn."""
+    json: Path | None = None
+    """File for the rows."""
+
+
+class Row(NamedTuple):
+    """What one run did."""
+
+    mlflow: str
+    iterations: int
+    iterations_per_s: float
+    ratio: float
+    """Of iterations/s to those without tracking."""
+    cpu_ratio: float
+    """Of the processor's seconds, all threads together, without tracking to those with it."""
+    records: int
+    """On disk."""
+    delivered: int
+
+
+@contextmanager
+def slow_server() -> Iterator[str]:
+    """Yield the address of a server that waits before it answers."""
+    over = threading.Event()
+
+    class Slow(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            over.wait(DELAY)
+            self.send_error(503)
+
+        do_POST = do_GET  # noqa: N815
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Say nothing."""
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Slow)
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+    finally:
+        over.set()
+        server.shutdown()
+        server.server_close()
+
+
+class Run:
+    """Meta-training, with a tracker or without."""
+
+    def __init__(self, name: str, folder: Path, uri: str | None) -> None:
+        """Open the tracker, and let it ask for the first time."""
+        self.name, self.folder = name, folder
+        self.cpu_seconds: list[float] = []
+        self._training = LocalMetaTraining(made_up_plan("quick"))
+        self.tracker: Tracker | None = None
+        if uri is not None:
+            folder.mkdir()
+            os.environ["MLFLOW_TRACKING_URI"] = uri
+            self.tracker = Tracker(folder, "benchmark", console.print)
+            self.tracker.identify()
+
+    def go_on(self, count: int) -> None:
+        """Do the next iterations and track them, as an experiment does."""
+        began = time.process_time()
+        for iteration in self._training.iterations(count):
+            metrics = _metrics(iteration)
+            if self.tracker is not None:
+                self.tracker.metrics(iteration.number, metrics)
+        self.cpu_seconds.append(time.process_time() - began)
+
+    def row(self, seconds: Mapping[str, list[float]], cpu: list[float], iterations: int) -> Row:
+        """Close the tracker and return what has been found."""
+        if self.tracker is not None:
+            self.tracker.close("FINISHED")
+        return Row(
+            self.name,
+            iterations * len(seconds[self.name]),
+            float(iterations / np.median(seconds[self.name])),
+            float(np.median(np.divide(seconds[NONE], seconds[self.name]))),
+            float(np.median(np.divide(cpu, self.cpu_seconds))),
+            sum(1 for _ in read_spool(self.folder / "tracking.jsonl")),
+            Identity.of(self.folder).delivered if self.tracker is not None else 0,
+        )
+
+
+def _metrics(iteration: Iteration) -> dict[str, float]:
+    means = {name: float(np.mean([slot[name] for slot in iteration.slots])) for name in iteration.slots[0]}
+    return means | {"gradient_norm": iteration.gradient_norm, "iterations_per_second": 1 / iteration.timing.iteration}
+
+
+def measure(folder: Path, slow: str, rounds: int, iterations: int) -> list[Row]:
+    """Let the four take turns."""
+    addresses = {
+        NONE: None,
+        "down": "http://127.0.0.1:1",  # where nobody listens
+        "slow": slow,
+        "up (SQLite)": f"sqlite:///{folder / 'mlflow.db'}",
+    }
+    runs = {name: Run(name, folder / str(number), uri) for number, (name, uri) in enumerate(addresses.items())}
+    for each in runs.values():
+        each.go_on(WARM_UP)
+        each.cpu_seconds.clear()
+
+    def turn(each: Run) -> Callable[[], None]:
+        return lambda: each.go_on(iterations)
+
+    seconds = alternate({name: turn(each) for name, each in runs.items()}, rounds)
+    cpu = runs[NONE].cpu_seconds
+    return [each.row(seconds, cpu, iterations) for each in runs.values()]
+
+
+def table(rows: Sequence[Row]) -> Table:
+    """Lay the rows out for the terminal."""
+    view = Table(title="Meta-training of the quick size beside MLflow", box=SIMPLE)
+    for column in ("MLflow", "iterations", "it/s", "of none", "of none, by CPU time", "records", "delivered"):
+        view.add_column(column, justify="left" if column == "MLflow" else "right")
+    for row in rows:
+        view.add_row(
+            row.mlflow,
+            str(row.iterations),
+            f"{row.iterations_per_s:.2f}",
+            f"{row.ratio:.3f}",
+            f"{row.cpu_ratio:.3f}",
+            str(row.records),
+            str(row.delivered),
+        )
+    return view
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run the benchmark."""
+    given = parse(Arguments, __doc__ or "", arguments, Arguments())
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)))
+        rows = measure(folder, stack.enter_context(slow_server()), given.rounds, given.iterations)
+    console.print(table(rows))
+    console.print(f"{os.cpu_count()} CPUs, load average {os.getloadavg()[0]:.1f}, {given.rounds} rounds")
+    missed = [row for row in rows if row.ratio < LEAST]
+    lines = [f"missed: {row.mlflow}: {row.ratio:.3f} of the speed without tracking, wanted {LEAST}" for row in missed]
+    console.print("\n".join(lines) or "all targets are met")
+    if given.json is not None:
+        machine = {"cpus": os.cpu_count(), "load_average": os.getloadavg()[0]}
+        write_rows(given.json, [row._asdict() | machine for row in rows])
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(run, sys.argv[1:]))

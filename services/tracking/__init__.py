@@ -1,0 +1,200 @@
+"""MLflow tracking that never stops a run: records go to a file in the run's folder first, a thread delivers them."""
+
+import os
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from dmil_core.configs import ExperimentConfig
+from dmil_core.errors import RunError, UserError
+from services.provenance import git_commit, library_versions
+from services.tracking.delivery import Delivery, Identity
+from services.tracking.spool import Artifact, Ended, Measured, Spool
+
+# A call that MLflow's client made again by itself could make a second run. A slow answer is no trouble for a thread.
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "60")
+os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+
+__all__ = ["DEFAULT_URI", "Tracker", "in_words", "introduce", "redacted", "tracking_uri"]
+
+DEFAULT_URI = "sqlite:///mlflow.db"
+RETRY_SECONDS = 10.0
+LINGER_SECONDS = 1.0
+"""How long records are gathered before they are sent together."""
+FAREWELL_SECONDS = 3.0
+"""How long the end of a run waits for an MLflow that has failed or been slow."""
+
+
+def tracking_uri() -> str:
+    """Return ``MLFLOW_TRACKING_URI``, or an SQLite file in the working directory."""
+    return os.environ.get("MLFLOW_TRACKING_URI") or DEFAULT_URI
+
+
+def redacted(text: str) -> str:
+    """Return an address, or a text with addresses in it, without users, passwords and tokens."""
+    text = re.sub(r"://[^\s'\"]*@", "://...@", text)
+    return re.sub(r"(?i)((?:password|passwd|token|secret|key)=)[^&\s'\"]+", r"\1...", text)
+
+
+def in_words(error: Exception) -> str:
+    """Return what went wrong with a delivery, in one line without secrets."""
+    text = redacted(" ".join(str(error).split()))
+    return text if isinstance(error, UserError | RunError) else f"{type(error).__name__}: {text[:200]}"
+
+
+class Tracker:
+    """One MLflow run, fed from ``tracking.jsonl`` in the run's folder."""
+
+    def __init__(self, folder: Path, experiment: str, say: Callable[[str], None]) -> None:
+        """Open the MLflow run that belongs to a run's folder, or make one as soon as MLflow answers.
+
+        Args:
+            folder: of the run; a folder that was tracked before continues the same MLflow run.
+            experiment: the MLflow experiment's name.
+            say: where messages go: one when MLflow does not take records, one when some are left at the end.
+
+        Raises:
+            SpoolError: if a record of the run so far is damaged.
+            IdentityError: if the file that says which MLflow run it is, is.
+            DiskFullError: for want of space.
+        """
+        uri = tracking_uri()
+        self.uri = redacted(uri)
+        """Of MLflow, without secrets."""
+        self._folder, self._say = folder, say
+        self._spool = Spool(folder / "tracking.jsonl")
+        Identity.found_or_made(folder, experiment)
+        self._delivery = Delivery(folder, uri)
+        self._opened = time.monotonic()
+        self._closing = threading.Event()
+        self._failed = self._complained = False
+        self._thread = threading.Thread(target=self._work, name="mlflow", daemon=True)
+        self._spool.append("begin", None)
+        self._thread.start()
+
+    @property
+    def run_id(self) -> str | None:
+        """The MLflow run's id, as far as it is known."""
+        return self._delivery.run_id
+
+    def parameters(self, values: Mapping[str, Any]) -> None:
+        """Record settings; MLflow keeps the first value of each, a resumed run's other value becomes a tag."""
+        self._spool.append("parameters", {name: str(value) for name, value in values.items()})
+
+    def metrics(self, step: int, values: Mapping[str, float], *, anew: bool = False) -> None:
+        """Record metrics of one iteration, but none twice: a resumed run does some iterations again.
+
+        Args:
+            step: the iteration.
+            values: by name.
+            anew: they may have been measured again in another way; those that came out otherwise are recorded too.
+        """
+        before = {name: self._spool.measured.get(name, {}).get(step) for name in values}
+        new = {
+            name: value for name, value in values.items() if before[name] is None or (anew and before[name] != value)
+        }
+        if new:
+            self._spool.append("metrics", Measured(step=step, time=_now(), values=new))
+
+    def tags(self, values: Mapping[str, str]) -> None:
+        """Record tags; a later value replaces an earlier one."""
+        self._spool.append("tags", dict(values))
+
+    def inputs(self, digests: Mapping[str, str]) -> None:
+        """Record data sets by name and digest as the run's inputs."""
+        self._spool.append("inputs", dict(digests))
+
+    def artifact(self, path: Path, folder: str | None = None) -> None:
+        """Record a file or folder below the run's folder as an artifact."""
+        below = path.absolute().relative_to(self._folder.absolute())
+        self._spool.append("artifact", Artifact(path=str(below), folder=folder))
+
+    def identify(self, patience: float = 20.0) -> str | None:
+        """Return the MLflow run's id, or None if it is not known yet.
+
+        Args:
+            patience: seconds, counted from the tracker's opening, to wait for it while MLflow neither fails nor is
+                slow; 0 does not wait.
+        """
+        while self.run_id is None and not self._troubled() and time.monotonic() < self._opened + patience:
+            time.sleep(0.02)
+        return self.run_id
+
+    def close(self, status: str, patience: float = 60.0) -> bool:
+        """End the MLflow run; return whether all records have been delivered, and say so if not.
+
+        It raises nothing, so as not to hide what ended the run.
+
+        Args:
+            status: how the run ended: FINISHED, FAILED or KILLED.
+            patience: seconds to wait for the delivery while MLflow neither fails nor is slow.
+        """
+        try:
+            self._spool.append("end", Ended.model_validate({"status": status, "time": _now()}))
+        except (OSError, RunError) as error:
+            self._say(f"the end of the run is not recorded: {error}")
+        self._closing.set()
+        started = time.monotonic()
+        while self._thread.is_alive() and time.monotonic() < started + patience:
+            self._thread.join(0.05)
+            if self._troubled():
+                patience = min(patience, FAREWELL_SECONDS)
+        self._spool.close()
+        left = self._spool.count - self._delivery.delivered
+        if left:
+            self._say(
+                f"{left} of {self._spool.count} MLflow records wait in {self._spool.path}; when MLflow answers again: "
+                f"python -m services.tracking flush {self._folder}"
+            )
+        return not left
+
+    def _troubled(self) -> bool:
+        return self._failed or self._delivery.slow
+
+    def _work(self) -> None:
+        try:
+            while not self._delivered(closing=self._closing.wait(LINGER_SECONDS)):
+                pass
+        finally:
+            self._delivery.close()
+
+    def _delivered(self, *, closing: bool) -> bool:
+        """Deliver what there is, and return whether it is time to end."""
+        try:
+            self._delivery.deliver()
+        except Exception as error:  # noqa: BLE001  whatever MLflow raises, training goes on
+            self._failed = True
+            if not self._complained:
+                self._complained = True
+                self._say(
+                    f"MLflow at {self.uri} does not take records ({in_words(error)}); training goes on, "
+                    f"records wait in {self._spool.path}"
+                )
+            if not closing:
+                self._closing.wait(RETRY_SECONDS)
+            return closing
+        self._failed = False
+        return closing
+
+
+def introduce(tracker: Tracker, config: ExperimentConfig) -> None:
+    """Record what a run is: every setting, the commit of the code and the versions of the libraries."""
+    tracker.parameters(dict(_flat(config.model_dump(mode="json"), "")))
+    tracker.tags({"suite": config.suite.name, "method": config.method.name, "seed": str(config.seed)})
+    tracker.tags({"git_commit": git_commit(), **{f"version.{name}": v for name, v in library_versions().items()}})
+
+
+def _flat(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _now() -> int:
+    return int(time.time() * 1000)

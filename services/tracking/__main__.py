@@ -1,0 +1,91 @@
+"""Deliver the records of a run to MLflow that it did not take while the run was on, or tell how many those are.
+
+MLflow is where MLFLOW_TRACKING_URI says, and else the file mlflow.db in this folder.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from tyro.conf import Positional
+
+from dmil_core.errors import RunError, UserError
+from services.command_line import exit_code, parse
+from services.progress import console
+from services.tracking import in_words, redacted, tracking_uri
+from services.tracking.delivery import Delivery
+
+__all__ = ["Arguments", "NoRunError", "run"]
+
+
+class NoRunError(UserError):
+    """A folder that holds no tracked run."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Arguments of ``tracking``."""
+
+    action: Positional[Literal["flush", "status"]]
+    """Deliver what waits, or tell what does."""
+    run: Positional[str]
+    """Name or folder of a run."""
+    runs: Path = Path("runs")
+    """The folder that runs' own folders are in."""
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run the program.
+
+    Raises:
+        NoRunError: if there is no such run.
+        RunError: if MLflow does not take the records, or another process is delivering them.
+    """
+    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, tyro.MISSING))
+    folder = _find(given.run, given.runs)
+    uri = tracking_uri()
+    delivery = Delivery(folder, uri)
+    try:
+        _flush(delivery, folder, uri) if given.action == "flush" else _status(delivery)
+    finally:
+        delivery.close()
+
+
+def _find(name: str, runs: Path) -> Path:
+    for folder in (Path(name), runs / name):
+        if (folder / "tracking.jsonl").is_file():
+            return folder
+    raise NoRunError(
+        f"RUN: got {name!r}; wanted the folder of a run, which holds tracking.jsonl, or the name of one in {runs}"
+    )
+
+
+def _flush(delivery: Delivery, folder: Path, uri: str) -> None:
+    before = delivery.delivered
+    waiting = len(delivery.waiting())
+    try:
+        delivery.deliver()
+    except (RunError, UserError):
+        raise
+    except Exception as error:  # noqa: BLE001  MLflow and what is below it raise many kinds
+        raise RunError(
+            f"MLflow at {redacted(uri)} does not take records: {in_words(error)}; {delivery.delivered - before} of "
+            f"{waiting} were delivered, the others wait in {folder / 'tracking.jsonl'}; set MLFLOW_TRACKING_URI to "
+            "the MLflow that the run began with, and flush again"
+        ) from None  # its text may hold secrets
+    console.print(f"delivered: {delivery.delivered - before} of {waiting} records, MLflow run {delivery.run_id}")
+
+
+def _status(delivery: Delivery) -> None:
+    waiting = len(delivery.waiting())
+    console.print(f"MLflow run: {delivery.run_id or 'not there yet'}")
+    console.print(f"records: {delivery.delivered + waiting}, delivered {delivery.delivered}, waiting {waiting}")
+    if delivery.busy():
+        console.print("a process, the run itself or a flush, is delivering them")
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(run, sys.argv[1:]))

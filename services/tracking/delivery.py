@@ -1,0 +1,254 @@
+"""From a run's folder to MLflow: every record in its order, noted as delivered once MLflow has taken it."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from uuid import uuid4
+
+from filelock import FileLock, Timeout
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from dmil_core.errors import RunError, UserError
+from services.disk import read_file, sync, write_file
+from services.tracking.sending import next_batch, send
+from services.tracking.spool import Line, read_spool
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+
+__all__ = ["RUN_TAG", "BusyError", "Delivery", "Identity", "IdentityError"]
+
+RUN_TAG = "dmil.run"
+"""The tag by which a run is found again whose id was never noted."""
+SLOW_SECONDS = 5.0
+"""A server that takes longer for a call is not waited for."""
+OPENING_SECONDS = 20.0
+"""A database has longer: on its first use MLflow makes its tables."""
+IDENTITY_BYTES = 10_000
+
+
+class IdentityError(UserError):
+    """A damaged ``mlflow_run.json``, or one that does not go with the records beside it."""
+
+
+class BusyError(RunError):
+    """Another process delivers the records of this run."""
+
+
+class Identity(BaseModel):
+    """Which MLflow run a folder belongs to and how far delivery got, ``mlflow_run.json``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    tag: str
+    """Our own id of the run, known before MLflow is asked for its."""
+    experiment: str
+    name: str
+    began: int
+    """In milliseconds since 1970."""
+    run_id: str | None = None
+    delivered: int = 0
+    """How many records MLflow has taken."""
+
+    @staticmethod
+    def of(folder: Path) -> "Identity":
+        """Read the identity of a run.
+
+        Raises:
+            IdentityError: if there is none, or it is damaged.
+        """
+        path = folder / "mlflow_run.json"
+        try:
+            return Identity.model_validate_json(read_file(path, IDENTITY_BYTES))
+        except (OSError, ValidationError) as error:
+            got = error.strerror if isinstance(error, OSError) else "; ".join(_problems(error))
+            raise IdentityError(
+                f"{path}: got {got}; wanted what a tracked run writes there: the id of its MLflow run; put it back, or "
+                "delete it, and the next --resume gives the run's records to a new MLflow run"
+            ) from error
+
+    @staticmethod
+    def found_or_made(folder: Path, experiment: str) -> "Identity":
+        """Read the identity of a run, or give it one.
+
+        Raises:
+            IdentityError: if it is damaged.
+        """
+        path = folder / "mlflow_run.json"
+        if not path.exists():
+            made = Identity(tag=uuid4().hex, experiment=experiment, name=folder.name, began=int(time.time() * 1000))
+            write_file(path, made.model_dump_json())
+        return Identity.of(folder)
+
+
+class Delivery:
+    """Delivers the records of one run; of all processes, one at a time."""
+
+    def __init__(self, folder: Path, uri: str) -> None:
+        """Prepare the delivery; nothing is asked of MLflow yet.
+
+        Args:
+            folder: of a run that has an identity.
+            uri: of MLflow.
+
+        Raises:
+            IdentityError: if the identity is missing or damaged.
+            SpoolError: if a record is.
+        """
+        self._folder, self._uri = folder, uri
+        self._lock = FileLock(folder / "tracking.lock", thread_local=False)
+        self._client: MlflowClient | None = None
+        self._limit = SLOW_SECONDS if uri.startswith("http") else OPENING_SECONDS
+        self._asked: float | None = None
+        self._was_slow = False
+        self._identity = Identity.of(folder)
+        self._offset = self._delivered_bytes()
+
+    @property
+    def run_id(self) -> str | None:
+        """The MLflow run's id, as far as it is known."""
+        return self._identity.run_id
+
+    @property
+    def delivered(self) -> int:
+        """How many records MLflow has taken."""
+        return self._identity.delivered
+
+    @property
+    def slow(self) -> bool:
+        """Whether MLflow let us wait long for its last answer, or lets us wait now."""
+        asked = self._asked
+        return self._was_slow or (asked is not None and time.monotonic() - asked > self._limit)
+
+    def waiting(self) -> list[Line]:
+        """Return the records that MLflow has not taken yet.
+
+        Raises:
+            SpoolError: if one is damaged.
+        """
+        return list(read_spool(self._folder / "tracking.jsonl", line=self.delivered, offset=self._offset))
+
+    def busy(self) -> bool:
+        """Tell whether another process is at it."""
+        try:
+            with self._lock.acquire(blocking=False):
+                return False
+        except Timeout:
+            return True
+
+    def deliver(self) -> None:
+        """Send every record that waits, and after each batch note how far delivery got.
+
+        A batch that MLflow took before a crash kept us from noting it is sent again, which changes nothing there:
+        MLflow keeps one of equal metrics, parameters, tags and inputs.
+
+        Raises:
+            BusyError: if another process is at it.
+            SpoolError: if a record is damaged.
+            MlflowException: or whatever else MLflow and what is below it raise, if it does not take a record.
+        """
+        self._take_over()
+        waiting = self.waiting()
+        if not waiting:
+            return
+        client, run_id = self._open()
+        while waiting:
+            batch = next_batch(waiting)
+            with self._asking():
+                send(client, run_id, self._folder, batch)
+            waiting = waiting[len(batch) :]
+            # Records must not be noted as delivered that a power failure would take back.
+            sync(self._folder / "tracking.jsonl")
+            self._offset = batch[-1].end
+            self._note(delivered=batch[-1].number)
+
+    def close(self) -> None:
+        """Let others deliver."""
+        self._lock.release()
+
+    def _take_over(self) -> None:
+        """Be the one that delivers, from where the last one left off."""
+        if self._lock.is_locked:
+            return
+        try:
+            self._lock.acquire(blocking=False)
+        except Timeout as error:
+            raise BusyError(
+                f"{self._folder}: another process, the run itself or a flush, delivers its records; wait for its end"
+            ) from error
+        self._identity = Identity.of(self._folder)
+        self._offset = self._delivered_bytes()
+
+    def _delivered_bytes(self) -> int:
+        path, count = self._folder / "tracking.jsonl", self.delivered
+        ends = [line.end for line in islice(read_spool(path), count)]
+        if len(ends) < count:
+            raise IdentityError(
+                f"{self._folder / 'mlflow_run.json'}: got {count} records delivered; wanted at most the {len(ends)} of "
+                f"{path}: restore the two together"
+            )
+        return ends[-1] if ends else 0
+
+    def _open(self) -> "tuple[MlflowClient, str]":
+        if self._client is None:
+            from mlflow import MlflowClient  # takes seconds to import: not before it is needed
+
+            with self._asking():
+                self._client = MlflowClient(self._uri)
+        run_id = self.run_id
+        if run_id is None:
+            run_id = self._run_in(self._client, self._experiment_in(self._client))
+            self._note(run_id=run_id)
+        return self._client, run_id
+
+    def _experiment_in(self, client: "MlflowClient") -> str:
+        """Return the id of our experiment, which is made if it is not there."""
+        name = self._identity.experiment
+        with self._asking():
+            found = client.get_experiment_by_name(name)
+        if found:
+            return found.experiment_id
+        with self._asking():
+            return client.create_experiment(name, artifact_location=_beside(self._uri))
+
+    def _run_in(self, client: "MlflowClient", experiment_id: str) -> str:
+        """Return the id of our run: of one that was made before its id could be noted, or of a new one."""
+        tag = self._identity.tag
+        with self._asking():
+            found = client.search_runs([experiment_id], f"tags.`{RUN_TAG}` = '{tag}'", order_by=["created ASC"])
+        if found:
+            return found[0].info.run_id
+        with self._asking():
+            made = client.create_run(
+                experiment_id, self._identity.began, tags={RUN_TAG: tag}, run_name=self._identity.name
+            )
+        return made.info.run_id
+
+    @contextmanager
+    def _asking(self) -> Iterator[None]:
+        """Take the time of a call, so that others can see how long it is out."""
+        self._asked = asked = time.monotonic()
+        try:
+            yield
+        finally:
+            self._was_slow = time.monotonic() - asked > self._limit
+            self._asked = None
+
+    def _note(self, **changed: Any) -> None:
+        self._identity = self._identity.model_copy(update=changed)
+        write_file(self._folder / "mlflow_run.json", self._identity.model_dump_json())
+
+
+def _problems(error: ValidationError) -> Iterator[str]:
+    for problem in error.errors(include_url=False):
+        yield f"{'.'.join(map(str, problem['loc'])) or 'no object'}: {problem['msg']}"
+
+
+def _beside(uri: str) -> str | None:
+    """Return where artifacts go: beside an SQLite file, and else where the server says."""
+    if not uri.startswith("sqlite:///"):
+        return None
+    return (Path(uri.removeprefix("sqlite:///")).resolve().parent / "mlartifacts").as_uri()

@@ -1,0 +1,102 @@
+"""Records as calls of MLflow."""
+
+from collections.abc import Iterator, Sequence
+from itertools import takewhile
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from services.tracking.spool import Artifact, Ended, Line, Measured
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+
+__all__ = ["METRICS_PER_CALL", "next_batch", "send"]
+
+T = TypeVar("T")
+METRICS_PER_CALL = 1000
+"""What MLflow takes in one batch."""
+TEXTS_PER_CALL = 100
+
+
+def next_batch(waiting: Sequence[Line]) -> Sequence[Line]:
+    """Return the first records, as many as go into one call."""
+    if not isinstance(waiting[0].value, Measured):
+        return waiting[:1]
+    metrics = list(takewhile(lambda line: isinstance(line.value, Measured), waiting))
+    room = METRICS_PER_CALL - len(metrics[0].value.values)
+    taken = 1
+    while taken < len(metrics) and (room := room - len(metrics[taken].value.values)) >= 0:
+        taken += 1
+    return metrics[:taken]
+
+
+def send(client: "MlflowClient", run_id: str, folder: Path, batch: Sequence[Line]) -> None:
+    """Have MLflow take records that go into one call."""
+    kind, value = batch[0].kind, batch[0].value
+    if kind == "begin":
+        client.update_run(run_id, status="RUNNING")
+    elif kind == "metrics":
+        _send_metrics(client, run_id, [line.value for line in batch])
+    elif kind == "parameters":
+        _send_parameters(client, run_id, value)
+    elif kind == "tags":
+        _send_tags(client, run_id, value)
+    elif kind == "inputs":
+        _send_inputs(client, run_id, value)
+    elif kind == "artifact":
+        _send_artifact(client, run_id, folder, value)
+    elif kind == "end":
+        _send_end(client, run_id, value)
+
+
+def _send_metrics(client: "MlflowClient", run_id: str, values: list[Measured]) -> None:
+    from mlflow.entities import Metric
+
+    metrics = [
+        Metric(name, value, measured.time, measured.step)
+        for measured in values
+        for name, value in measured.values.items()
+    ]
+    for part in _parts(metrics, METRICS_PER_CALL):
+        client.log_batch(run_id, metrics=part, synchronous=True)
+
+
+def _send_parameters(client: "MlflowClient", run_id: str, values: dict[str, str]) -> None:
+    from mlflow.entities import Param
+
+    there = client.get_run(run_id).data.params
+    for part in _parts([Param(name, values[name]) for name in values.keys() - there], TEXTS_PER_CALL):
+        client.log_batch(run_id, params=part, synchronous=True)
+    changed = {f"resumed.{name}": value for name, value in values.items() if there.get(name, value) != value}
+    _send_tags(client, run_id, changed)
+
+
+def _send_tags(client: "MlflowClient", run_id: str, values: dict[str, str]) -> None:
+    from mlflow.entities import RunTag
+
+    for part in _parts([RunTag(name, value) for name, value in values.items()], TEXTS_PER_CALL):
+        client.log_batch(run_id, tags=part, synchronous=True)
+
+
+def _send_inputs(client: "MlflowClient", run_id: str, values: dict[str, str]) -> None:
+    from mlflow.entities import Dataset, DatasetInput
+
+    inputs = [DatasetInput(Dataset(name, sha[:32], "local", name), []) for name, sha in values.items()]
+    client.log_inputs(run_id, datasets=inputs)
+
+
+def _send_artifact(client: "MlflowClient", run_id: str, folder: Path, value: Artifact) -> None:
+    path = folder / value.path
+    if not path.exists():
+        _send_tags(client, run_id, {f"missing.{value.path}": "was gone before MLflow could be given it"})
+        return
+    send = client.log_artifacts if path.is_dir() else client.log_artifact
+    send(run_id, str(path), value.folder)
+
+
+def _send_end(client: "MlflowClient", run_id: str, value: Ended) -> None:
+    client.set_terminated(run_id, value.status, value.time)
+
+
+def _parts(items: list[T], size: int) -> Iterator[list[T]]:
+    return (items[first : first + size] for first in range(0, len(items), size))

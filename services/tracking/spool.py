@@ -1,0 +1,153 @@
+"""The records of a run on disk, ``tracking.jsonl``: one JSON line each, in the order in which they were made."""
+
+import errno
+import json
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, ValidationError
+
+from dmil_core.errors import UserError
+from services.disk import room_for
+
+__all__ = ["Line", "Measured", "Spool", "SpoolError", "read_spool"]
+
+
+LONGEST_LINE = 2**22
+
+
+class SpoolError(UserError):
+    """A damaged line among the records of a run."""
+
+
+class _Content(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class Measured(_Content):
+    """Metrics of one iteration."""
+
+    step: int
+    time: int
+    """In milliseconds since 1970; MLflow tells metrics apart by it, so it is noted here, once."""
+    values: dict[str, float]
+
+
+class Ended(_Content):
+    """How and when a run ended."""
+
+    status: Literal["FINISHED", "FAILED", "KILLED"]
+    time: int
+
+
+def _below(path: str) -> str:
+    if Path(path).is_absolute() or ".." in Path(path).parts:
+        raise ValueError("wanted a path below the run's folder")
+    return path
+
+
+class Artifact(_Content):
+    """A file or folder of the run: only such are ever sent, whatever the file of records says."""
+
+    path: Annotated[str, AfterValidator(_below)]
+    folder: str | None
+    """Where it goes among the run's artifacts."""
+
+
+Texts = dict[str, str]
+_RECORD: TypeAdapter[tuple[str, Any]] = TypeAdapter(
+    tuple[Literal["begin"], None]
+    | tuple[Literal["metrics"], Measured]
+    | tuple[Literal["parameters", "tags", "inputs"], Texts]
+    | tuple[Literal["artifact"], Artifact]
+    | tuple[Literal["end"], Ended]
+)
+
+
+class Line(NamedTuple):
+    """One record, and where it stands."""
+
+    kind: str
+    value: Any
+    number: int
+    """From 1, as editors count."""
+    end: int
+    """The bytes of the file up to and with it."""
+
+
+def read_spool(path: Path, *, line: int = 0, offset: int = 0) -> Iterator[Line]:
+    """Yield the records of a file that may still grow; a last line without its end is none yet.
+
+    Args:
+        path: the file; one that is not there holds no records.
+        line: how many lines stand before the offset.
+        offset: bytes to leave out.
+
+    Raises:
+        SpoolError: names the file and the line that is damaged.
+    """
+    if not path.exists():
+        return
+    if not path.is_file():
+        raise SpoolError(f"{path}: got no regular file; wanted a file of records; remove it")
+    with path.open("rb") as file:
+        file.seek(offset)
+        for number, text in enumerate(iter(lambda: file.readline(LONGEST_LINE), b""), line + 1):
+            if not text.endswith(b"\n") and len(text) < LONGEST_LINE:
+                return
+            offset += len(text)
+            try:
+                kind, value = _RECORD.validate_json(text)
+            except ValidationError as error:
+                raise SpoolError(
+                    f"{path}, line {number}: got {text[:60]!r}; wanted a record, as of tags or metrics, in JSON; put "
+                    '["tags", {}] in its place to go on without it'
+                ) from error
+            yield Line(kind, value, number, offset)
+
+
+class Spool:
+    """The file of records, open for more."""
+
+    def __init__(self, path: Path) -> None:
+        """Open a file of records, and cut off a last line that a killed process did not finish.
+
+        Raises:
+            SpoolError: names the file and the line that is damaged.
+        """
+        self.path = path
+        self.measured: defaultdict[str, dict[int, float]] = defaultdict(dict)
+        """The last value that is recorded of each metric at each step."""
+        self.count = self._size = 0
+        for line in read_spool(path):
+            self.count, self._size = line.number, line.end
+            if isinstance(line.value, Measured):
+                self._note(line.value)
+        self._file = path.open("ab", buffering=0)
+        self._file.truncate(self._size)
+
+    def append(self, kind: str, value: Any) -> None:
+        """Write one record, whole or not at all: a killed process loses none of those written.
+
+        Raises:
+            DiskFullError: for want of space.
+        """
+        content = value.model_dump() if isinstance(value, BaseModel) else value
+        line = json.dumps([kind, content]).encode() + b"\n"
+        with room_for(self.path, len(line)):
+            if self._file.write(line) < len(line):
+                self._file.truncate(self._size)
+                raise OSError(errno.ENOSPC, "No space left on device")
+        self.count, self._size = self.count + 1, self._size + len(line)
+        if isinstance(value, Measured):
+            self._note(value)
+
+    def _note(self, measured: Measured) -> None:
+        for name, value in measured.values.items():
+            self.measured[name][measured.step] = value
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
