@@ -31,14 +31,25 @@ class Settings(BaseModel):
 class SuiteConfig(Settings):
     """Which tasks there are, and when an episode counts as a success."""
 
-    name: Literal["ml10", "ml10-reference"] = "ml10"
-    """ml10: the benchmark's own split; ml10-reference: the split of the authors' released code."""
-    horizon: Size = 300
-    """Steps in an episode; it is a success if the task is solved at any of them."""
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]*$")] = "ml10"
+    """ml10 and ml45: Meta-World's own splits; ml10-reference: the one of the authors' released code; ML1-reach and the
+    like: one task; push-around-wall: the paper's new task after ml10's meta-training tasks (Figure 8)."""
+    protocol: Literal["paper", "benchmark"] = "paper"
+    """Steps in an episode: 300, or 500 as in Meta-World's own evaluation. In both it is a success if the task is solved
+    at any of them."""
+    goal_visible: bool = True
+    """Whether a policy sees where the goal is; Meta-World's own meta-learning benchmarks hide it."""
+    horizon: Size | None = None
+    """Steps in an episode, if not the protocol's."""
     train_tasks: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     """Use these meta-training tasks instead of all of the suite's."""
     test_tasks: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     """Use these meta-testing tasks instead of all of the suite's."""
+
+    @property
+    def steps(self) -> int:
+        """Steps in an episode: the horizon if given, else the protocol's."""
+        return {"paper": 300, "benchmark": 500}[self.protocol] if self.horizon is None else self.horizon
 
 
 class DemonstrationConfig(Settings):

@@ -72,7 +72,9 @@ class DemoStore:
     @staticmethod
     def dataset_id(task: str, suite: SuiteConfig, config: DemonstrationConfig) -> str:
         """Return the Minari id of a task's demonstrations: other settings, other id."""
-        settings = {"horizon": suite.horizon, **config.model_dump(exclude={"held_out"})}
+        settings = {"horizon": suite.steps, **config.model_dump(exclude={"held_out"})}
+        if not suite.goal_visible:
+            settings["goal_visible"] = False
         key = hashlib.sha256(json.dumps([task, settings], sort_keys=True).encode()).hexdigest()[:10]
         return f"{task}/scripted-{key}-v2"
 

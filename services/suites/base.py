@@ -10,7 +10,8 @@ __all__ = ["Attempt", "Environment", "Expert", "TaskSuite"]
 
 Environment = gymnasium.Env[np.ndarray, np.ndarray]
 """A task's environment. ``reset(seed=n)`` twice gives the same episode twice, and its info holds under ``goal`` what
-it drew at random; ``info["success"]`` of a step says whether the task is solved."""
+it drew at random; ``info["success"]`` of a step says whether the task is solved. Where observations leave out something
+that the expert needs, the infos of resets and steps hold the whole ones under ``full_observation``."""
 
 
 class Expert(Protocol):

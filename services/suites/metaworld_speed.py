@@ -76,7 +76,7 @@ class FastSteps(SawyerXYZEnv):
     _settled_with: bytes | None = None
 
     def _initialize_simulation(self) -> tuple[Any, Any]:
-        model = copy.copy(_compiled(self.fullpath))
+        model = copy.copy(_compiled(self.fullpath, getattr(self, "compile_scene", mujoco.MjModel.from_xml_path)))
         model.vis.global_.offwidth, model.vis.global_.offheight = self.width, self.height
         return model, mujoco.MjData(model)
 
@@ -189,8 +189,8 @@ class FastSteps(SawyerXYZEnv):
 
 
 @lru_cache(maxsize=1)  # 20 MB; environments of one task are built one after the other
-def _compiled(path: str) -> Any:
-    return mujoco.MjModel.from_xml_path(path)
+def _compiled(path: str, compile_scene: Callable[[str], Any]) -> Any:
+    return compile_scene(path)
 
 
 @cache
@@ -206,7 +206,7 @@ def _fast_class(stock: type[SawyerXYZEnv]) -> type[SawyerXYZEnv]:
             (reward_utils.tolerance, _tolerance),
         ]
     )
-    for parent in (SawyerXYZEnv, stock):
+    for parent in reversed(stock.__mro__[: stock.__mro__.index(SawyerXYZEnv) + 1]):
         for name, member in vars(parent).items():
             if isinstance(member, FunctionType) and name != "__init__":
                 setattr(rebound, name, exchange.rebind(member))
@@ -289,9 +289,8 @@ def success_functions(task: type[SawyerXYZEnv]) -> tuple[FunctionType, FunctionT
     call.value.func.attr = "_success_terms"
     before, _ = _needed_for(evaluation.body[:at], needed)
     evaluation.body = [*before, call, *after] if any(wanted) else [*before, *after]
-    current: Any = next(
-        line for line in computation.body if "self.reward_function_version == 'v2'" in ast.unparse(line)
-    )
+    versions = (line for line in computation.body if "self.reward_function_version == 'v2'" in ast.unparse(line))
+    current: Any = next(versions, computation)
     terms = current.body[-1].value
     if len(terms.elts) == len(wanted):  # two tasks return in another form: of these all terms stay
         terms.elts = [term if want else ast.Constant(None) for term, want in zip(terms.elts, wanted, strict=True)]

@@ -66,8 +66,8 @@ class Tracker:
         self.uri = redacted(uri)
         """Of MLflow, without secrets."""
         self._folder, self._say = folder, say
-        self._spool = Spool(folder / "tracking.jsonl")
         Identity.found_or_made(folder, experiment)
+        self._spool = Spool(folder / "tracking.jsonl")
         self._delivery = Delivery(folder, uri)
         self._opened = time.monotonic()
         self._closing = threading.Event()

@@ -48,7 +48,9 @@ def test_presets_leave_enough_demonstrations_for_four_disjoint_sets(preset: Expe
 @pytest.mark.parametrize(
     ("config", "field", "value"),
     [
-        (SuiteConfig, "name", "ml11"),
+        (SuiteConfig, "name", ""),
+        (SuiteConfig, "name", "ml10/../x"),
+        (SuiteConfig, "protocol", "own"),
         (SuiteConfig, "horizon", 0),
         (DemonstrationConfig, "per_task", 0),
         (DemonstrationConfig, "held_out", 0),

@@ -250,6 +250,16 @@ def test_other_settings_other_id():
     assert name() == name(held_out=10), "which are held out does not change what is collected"
 
 
+def test_what_a_policy_may_see_is_part_of_the_id_and_the_rest_of_the_suite_is_not():
+    def name(**settings: object) -> str:
+        return DemoStore.dataset_id("reach", SuiteConfig.model_validate(settings), DemonstrationConfig())
+
+    assert name() == "reach/scripted-5a967c1797-v2", "data sets that are there would be collected again"
+    assert name() == name(name="ml45") == name(horizon=300) == name(test_tasks=("push-around-wall",))
+    assert name(protocol="benchmark") == name(horizon=500) != name()
+    assert name(goal_visible=False) != name()
+
+
 def digests(experiment: Experiment, kind, workers: int | None) -> dict[str, tuple[str, int]]:
     with open_runner(kind, experiment.suite, workers) as runner:
         return {task: (dataset.digest, dataset.failed) for task, dataset in experiment.collect(runner).items()}
