@@ -34,10 +34,10 @@ __all__ = ["Arguments", "run"]
 
 VICTIMS = {"worker": 6, "all workers": 1, "learner": 2, "driver": 2}
 """What is killed, and how often against the others."""
-KILLS_PER_RUN = 8
+KILLS_PER_RUN = 10
 SETTINGS = (
-    "--preset", "ml10-smoke", "--workers", "2", "--training.iterations", "600", "--training.checkpoint-every", "50",
-    "--training.tasks-per-iteration", "6", "--evaluation.every", "200", "--method.hidden-units", "64",
+    "--preset", "ml10-smoke", "--workers", "2", "--training.iterations", "240", "--training.checkpoint-every", "20",
+    "--training.tasks-per-iteration", "4", "--evaluation.every", "80",
 )  # fmt: skip
 SECONDS_BETWEEN = 3.0
 """Mean time from one kill to the next."""
