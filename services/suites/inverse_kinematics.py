@@ -1,12 +1,14 @@
 """Differential inverse kinematics of an arm: damped least squares on MuJoCo's Jacobian, within bounds."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import mujoco
+import mujoco as compiled_mujoco
 import numpy as np
 from jaxtyping import Float64
 
 __all__ = ["Arm", "Pose", "bounded_least_squares", "pose_error"]
+
+mujoco: Any = compiled_mujoco  # compiled, so a type checker sees nothing of it
 
 
 class Pose(NamedTuple):
@@ -52,7 +54,7 @@ def bounded_least_squares(
 class Arm:
     """Kinematics of an arm whose joints come first in its model, on simulator data of its own."""
 
-    def __init__(self, model: mujoco.MjModel, hand: str, joints: int) -> None:
+    def __init__(self, model: Any, hand: str, joints: int) -> None:
         """Compute for the site named `hand` and the first `joints` joints, all of them hinges."""
         self._model, self._data, self._joints = model, mujoco.MjData(model), joints
         self._hand = model.site(hand).id

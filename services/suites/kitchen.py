@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from itertools import combinations
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -71,8 +71,6 @@ class KitchenTask(gymnasium.Env[np.ndarray, np.ndarray]):
     a step, whatever becomes of it afterwards, and in any order. The reward is the number that a step adds to the
     score.
     """
-
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
 
     def __init__(self, chain: Sequence[str], start_noise: float = 1.0) -> None:
         """Build the simulation.

@@ -10,15 +10,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import gymnasium_robotics
-import mujoco
+import mujoco as compiled_mujoco
 import numpy as np
 from jaxtyping import Float32, Float64
 
 from services.suites.inverse_kinematics import Arm, Pose, bounded_least_squares, pose_error
 
 __all__ = ["SUB_TASKS", "KitchenExpert", "SubTask", "kitchen_model"]
+
+mujoco: Any = compiled_mujoco  # compiled, so a type checker sees nothing of it
 
 STEP = 0.08
 """Seconds in a step of the environment."""
@@ -29,7 +32,7 @@ LIFT = np.array([0.0, 0.0, 1.0])
 
 
 @cache
-def kitchen_model() -> mujoco.MjModel:
+def kitchen_model() -> Any:
     """Return the environment's model, read once in a process."""
     assets = Path(gymnasium_robotics.__file__).parent / "envs/assets/kitchen_franka"
     return mujoco.MjModel.from_xml_path(str(assets / "kitchen_assets/kitchen_env_model.xml"))
