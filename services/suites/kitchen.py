@@ -1,5 +1,7 @@
 """The Franka kitchen (Gupta et al. 2019; gymnasium-robotics' ``FrankaKitchen-v1``): tasks are chains of sub-tasks."""
 
+import contextlib
+import io
 from collections.abc import Iterable, Sequence
 from itertools import combinations
 from typing import Any
@@ -7,13 +9,15 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
-from gymnasium_robotics.envs.franka_kitchen.kitchen_env import KitchenEnv
 from jaxtyping import Float32, Float64
 
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import UserError
 from services.suites.base import Environment, Expert
 from services.suites.kitchen_expert import KitchenExpert
+
+with contextlib.redirect_stderr(io.StringIO()):  # it prints a notice about environments that are not the kitchen
+    from gymnasium_robotics.envs.franka_kitchen.kitchen_env import KitchenEnv
 
 __all__ = ["NAMES", "SPLITS", "KitchenSuite", "KitchenTask", "UnknownKitchenTaskError", "chains", "replay"]
 

@@ -9,10 +9,10 @@ folded follow the demonstrations of Gupta et al. (2019).
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import gymnasium_robotics
 import mujoco as compiled_mujoco
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -34,7 +34,10 @@ LIFT = np.array([0.0, 0.0, 1.0])
 @cache
 def kitchen_model() -> Any:
     """Return the environment's model, read once in a process."""
-    assets = Path(gymnasium_robotics.__file__).parent / "envs/assets/kitchen_franka"
+    library = find_spec("gymnasium_robotics")  # without importing it: that prints a notice
+    assert library is not None
+    assert library.origin is not None
+    assets = Path(library.origin).parent / "envs/assets/kitchen_franka"
     return mujoco.MjModel.from_xml_path(str(assets / "kitchen_assets/kitchen_env_model.xml"))
 
 
@@ -199,11 +202,12 @@ def burner(knob: str, joint: int) -> SubTask:
         return scene.site(knob) - 0.04 * ahead / np.linalg.norm(ahead)
 
     def act(scene: Scene) -> Target:
-        def rolled(angle: float) -> Pose:
-            return Pose(contact(scene), orient(ahead.tolist(), (np.cos(angle), 0, np.sin(angle))))
+        def rolled(angle: float, at: Float64[np.ndarray, "3"]) -> Pose:
+            return Pose(at, orient(ahead.tolist(), (np.cos(angle), 0, np.sin(angle))))
 
         angle = scene.qpos[joint]
-        return take(scene, rolled(angle), rolled(angle - 0.4), posture, 0.045)
+        moved = rolled(angle - 0.4, scene.site(knob))  # pressed against the knob, the fingers slip less
+        return take(scene, rolled(angle, contact(scene)), moved, posture, 0.045)
 
     return SubTask(joint, 0, -0.9, contact, act, clearance=0.07)
 
