@@ -32,7 +32,7 @@ from services.suites.base import Attempt
 
 __all__ = ["DemoStore", "TaskDemonstrations", "data_root"]
 
-LIBRARIES = ("gymnasium", "metaworld", "minari", "mujoco", "numpy")
+LIBRARIES = ("gymnasium", "gymnasium-robotics", "metaworld", "minari", "mujoco", "numpy")
 DIGESTS, ARRAYS, METADATA = "SHA256SUMS", "data/main_data.hdf5", "data/metadata.json"
 MOST_ARRAYS = 2**32
 """Bytes of a data set's file of arrays."""

@@ -1,6 +1,6 @@
 """Episodes of a policy or an expert in a suite's environments: pure, named by their seeds, no Ray."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +12,9 @@ from dmil_core.methods.base import FineTuning, Method, Policy, SubSkillUse
 from dmil_core.networks import Parameters
 from dmil_core.seeding import stream, stream_seed
 from services.results import Split
-from services.suites.base import Attempt, Environment, Expert, TaskSuite
+from services.suites.base import Attempt, Environment, Expert
 
-__all__ = ["Episode", "Trial", "TrialOutcome", "demonstrate", "rollout", "trials", "try_out", "verify"]
+__all__ = ["Episode", "Trial", "TrialOutcome", "demonstrate", "rollout", "trials", "try_out"]
 
 
 class Trial(NamedTuple):
@@ -109,23 +109,6 @@ def demonstrate(
             solved_at = len(actions) - 1
             end = min(horizon, len(actions) + trailing_steps)
     return Attempt(seed, goal, solved_at, np.asarray(observations, np.float32), np.asarray(actions, np.float32))
-
-
-def verify(suite: TaskSuite, task: str, seeds: Iterable[int], noise: float) -> dict[int, int | None]:
-    """Return for each seed at which step a task's expert first solved it within the horizon, or None.
-
-    Args:
-        suite: has the task, and an expert for it.
-        task: its name.
-        seeds: of the episodes.
-        noise: standard deviation of what is added to the executed action.
-    """
-    env, expert = suite.make_env(task), suite.expert(task)
-    assert expert is not None
-    try:
-        return {seed: demonstrate(expert, env, seed, suite.horizon, noise, 0).solved_at for seed in seeds}
-    finally:
-        env.close()
 
 
 def _clip(actions: np.ndarray, env: Environment) -> np.ndarray:

@@ -37,6 +37,7 @@ FLOORS = {
     "services.results": 3,
     "services.timing": 3,
     "services.rollouts": 4,
+    "services.verification": 4,
     "services.actors": 5,
     "services.runners": 6,
     "services.ray_runner": 6,

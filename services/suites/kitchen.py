@@ -1,0 +1,205 @@
+"""The Franka kitchen (Gupta et al. 2019; gymnasium-robotics' ``FrankaKitchen-v1``): tasks are chains of sub-tasks."""
+
+import contextlib
+import io
+from collections.abc import Iterable, Sequence
+from itertools import combinations
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+from jaxtyping import Float32, Float64
+
+from dmil_core.demonstrations import Demonstration
+from dmil_core.errors import UserError
+from services.suites.base import Environment, Expert
+from services.suites.kitchen_expert import KitchenExpert
+
+with contextlib.redirect_stderr(io.StringIO()):  # it prints a notice about environments that are not the kitchen
+    from gymnasium_robotics.envs.franka_kitchen.kitchen_env import KitchenEnv
+
+__all__ = ["NAMES", "SPLITS", "KitchenSuite", "KitchenTask", "UnknownKitchenTaskError", "chains", "replay"]
+
+NAMES = {
+    "microwave": "microwave",
+    "kettle": "kettle",
+    "bottomburner": "bottom burner",
+    "topburner": "top burner",
+    "light": "light switch",
+    "hinge": "hinge cabinet",
+    "slide": "slide cabinet",
+}
+"""The sub-tasks, in the order in which chains name them, and what gymnasium-robotics calls them."""
+
+
+class UnknownKitchenTaskError(UserError):
+    """A split, a sub-task or a chain that the kitchen does not have."""
+
+
+def chains(without: str, length: int = 4) -> tuple[str, ...]:
+    """Return all chains of `length` distinct sub-tasks, in the order of `NAMES`, that lack the one `without`."""
+    return tuple("-".join(chain) for chain in combinations([name for name in NAMES if name != without], length))
+
+
+SPLITS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    f"kitchen-{held_out}": (chains(held_out), (test,))
+    for held_out, test in (
+        ("topburner", "microwave-kettle-topburner-light"),
+        ("microwave", "microwave-bottomburner-light-slide"),
+        ("kettle", "microwave-kettle-hinge-slide"),
+        ("slide", "microwave-kettle-hinge-slide"),
+    )
+}
+"""Meta-training and meta-testing tasks of Table 5's four rows.
+
+The paper names the sub-task that meta-training lacks and the chain that is tested, not the chains that are trained:
+here they are all 15 chains of four of the other six sub-tasks.
+"""
+
+START_ANGLE = 0.05
+"""Radians by which each arm joint's first angle may differ from the environment's: the first states of the real
+demonstrations have standard deviations of 0.01 to 0.08."""
+START_KETTLE = 0.01
+"""Metres by which the kettle's first place may differ, in either direction of the stove."""
+
+
+class KitchenTask(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One chain of sub-tasks, from starts drawn at random.
+
+    An observation is the paper's 30-dimensional state: 9 angles and openings of the robot and 21 coordinates of the
+    objects, with the environment's sensor noise on them. An action holds 9 joint velocities in units of 2 rad/s (or
+    m/s, for the fingers); a step lasts 0.08 s.
+
+    A sub-task counts by gymnasium-robotics' rule: once its coordinates were nearer than 0.3 to its goal at the end of
+    a step, whatever becomes of it afterwards, and in any order. The reward is the number that a step adds to the
+    score.
+    """
+
+    def __init__(self, chain: Sequence[str], start_noise: float = 1.0) -> None:
+        """Build the simulation.
+
+        Args:
+            chain: sub-tasks, keys of `NAMES`.
+            start_noise: how far starts differ, in units of `START_ANGLE` and `START_KETTLE`.
+        """
+        self._env = KitchenEnv([NAMES[sub_task] for sub_task in chain])
+        self._rest = self._env.robot_env.init_qpos
+        spread = [START_ANGLE] * 7 + [START_KETTLE] * 2
+        self._spread = start_noise * np.array(spread)
+        self.observation_space = Box(-np.inf, np.inf, (30,), np.float64)
+        self.action_space = Box(-1, 1, (9,), np.float64)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        """Begin the episode of `seed`, or begin with ``options["state"]``, 30 positions of robot and objects.
+
+        ``info["goal"]`` holds how the start differs from the environment's: 7 angles in radians, 2 places of the
+        kettle in metres.
+        """
+        super().reset(seed=seed)
+        drawn = self.np_random.uniform(-self._spread, self._spread)
+        start = self._rest.copy()
+        start[[*range(7), 23, 24]] += drawn
+        if options is not None and "state" in options:
+            start = np.array(options["state"], np.float64)
+            drawn = (start - self._rest)[[*range(7), 23, 24]]
+        self._env.robot_env.init_qpos = start
+        observation, _ = self._env.reset(seed=int(self.np_random.integers(2**31)))
+        return state(observation["observation"]), {"goal": drawn.tolist(), "score": 0, "completed": []}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        """Advance by 0.08 s; info holds ``success``, the ``score`` and the names of the sub-tasks ``completed``."""
+        before = len(self._env.episode_task_completions)
+        observation, _, _, _, _ = self._env.step(action)
+        completed = [name for name in NAMES if NAMES[name] in self._env.episode_task_completions]
+        score = len(completed)
+        info = {"success": score == len(self._env.goal), "score": score, "completed": completed}
+        return state(observation["observation"]), float(score - before), False, False, info
+
+    def close(self) -> None:
+        """Free the simulation."""
+        self._env.close()
+
+
+def state(observation: Float64[np.ndarray, "59"]) -> Float64[np.ndarray, "30"]:
+    """Return the paper's state: the robot's 9 positions and the objects' 21, without velocities."""
+    return np.concatenate([observation[:9], observation[18:39]])
+
+
+class KitchenSuite:
+    """Chains in a split; an episode is a success if every sub-task was done at some step within the horizon."""
+
+    obs_dim = 30
+    action_dim = 9
+
+    def __init__(
+        self,
+        name: str = "kitchen-topburner",
+        *,
+        train_tasks: Iterable[str] | None = None,
+        test_tasks: Iterable[str] | None = None,
+        horizon: int = 280,
+        start_noise: float = 1.0,
+    ) -> None:
+        """Take a split of `SPLITS`, or some other chains in place of its own.
+
+        Raises:
+            UnknownKitchenTaskError: for a split or a sub-task that is not there, or a sub-task named twice.
+        """
+        if name not in SPLITS:
+            raise UnknownKitchenTaskError(f"suite.name: got {name}; wanted one of {', '.join(SPLITS)}")
+        train, test = SPLITS[name]
+        self.name = name if train_tasks is test_tasks is None else f"{name}-part"
+        self.train_tasks = train if train_tasks is None else tuple(train_tasks)
+        self.test_tasks = test if test_tasks is None else tuple(test_tasks)
+        for field, tasks in (("train_tasks", self.train_tasks), ("test_tasks", self.test_tasks)):
+            for task in tasks:
+                sub_tasks_of(task, f"suite.{field}")
+        self.horizon = horizon
+        self.start_noise = start_noise
+        self.protocol = f"each sub-task at any step within {horizon}; start noise {start_noise:g}"
+
+    def make_env(self, task: str) -> Environment:
+        """Build the environment of a chain, such as ``microwave-kettle-topburner-light``."""
+        return KitchenTask(sub_tasks_of(task), self.start_noise)
+
+    def expert(self, task: str) -> Expert:
+        """Return the scripted expert of a chain."""
+        return KitchenExpert(sub_tasks_of(task))
+
+
+def sub_tasks_of(task: str, field: str = "task") -> tuple[str, ...]:
+    """Return the sub-tasks that a chain's name lists.
+
+    Raises:
+        UnknownKitchenTaskError: for an unknown one, or one that is named twice.
+    """
+    chain = tuple(task.split("-"))
+    if not set(chain) <= set(NAMES) or len(set(chain)) < len(chain):
+        raise UnknownKitchenTaskError(
+            f"{field}: got {task}; wanted some of {', '.join(NAMES)}, each at most once, joined by hyphens"
+        )
+    return chain
+
+
+def replay(demonstration: Demonstration, *, seed: int = 0) -> tuple[str, ...]:
+    """Replay a demonstration's actions open loop from its first state; return the sub-tasks completed on the way.
+
+    Args:
+        demonstration: 30-dimensional states, and actions.
+        seed: of the environment's sensor noise, which acts on the robot too.
+    """
+    env = KitchenTask(tuple(NAMES))
+    _, info = env.reset(seed=seed, options={"state": resting(demonstration.observations[0])})
+    for action in demonstration.actions:
+        info = env.step(action)[4]
+    env.close()
+    return tuple(info["completed"])
+
+
+def resting(observed: Float32[np.ndarray, "30"]) -> Float64[np.ndarray, "30"]:
+    """Return positions that the simulation can begin with: an observed state without what noise makes impossible."""
+    start = observed.astype(np.float64)
+    start[7:9] = np.clip(start[7:9], 0, 0.04)
+    start[26:30] /= np.linalg.norm(start[26:30])
+    return start
