@@ -80,6 +80,11 @@ class Campaign:
         self._environment.pop("RAY_ADDRESS", None)
         self._environment["PYTHONPATH"] = str(Path(__file__).parents[1])
 
+    def collect(self) -> None:
+        """Make the demonstrations, which no run's seconds are to hold."""
+        command = [sys.executable, "-m", "services.collect_demos", *SETTINGS[:2], "--runner", "local"]
+        subprocess.run(command, cwd=self.folder, env=self._environment, check=True, stdout=subprocess.DEVNULL)
+
     def run(self, name: str, kills: int) -> Outcome:
         """Run the experiment, killing something of it so many times unless it ends before."""
         began, done, errors = time.monotonic(), Counter[str](), 0
@@ -213,7 +218,7 @@ def run(arguments: Sequence[str]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     campaign = Campaign(folder.resolve(), random.Random(given.seed))
     try:
-        campaign.run("collecting", 0)
+        campaign.collect()
         undisturbed = campaign.run("undisturbed", 0)
         outcomes: list[Outcome] = []
         with Bar("kills", given.kills) as bar:

@@ -11,7 +11,7 @@ import pytest
 PROJECT = Path(__file__).parents[2]
 
 
-def rows_of(program: str, *arguments: str, folder: Path) -> list[dict[str, Any]]:
+def rows_of(program: str, *arguments: str, folder: Path) -> Any:
     command = [sys.executable, "-m", f"benchmarks.{program}", *arguments, "--json", str(folder / "rows.json")]
     subprocess.run(command, cwd=PROJECT, check=True, capture_output=True)
     return json.loads((folder / "rows.json").read_text())
@@ -70,3 +70,11 @@ def test_tracking(tmp_path: Path) -> None:
         assert row["ratio"] > 0
         assert row["records"] == 3 + 2 + 2, "iterations, and where the run begins and ends"
     assert [row["delivered"] for row in (down, slow, up)] == [0, 0, 7]
+
+
+@pytest.mark.slow
+def test_faults(tmp_path: Path) -> None:
+    found = rows_of("faults", "--kills", "20", "--seed", "1", "--folder", str(tmp_path / "campaign"), folder=tmp_path)
+    assert (found["kills"], found["equal"], found["lost"], found["different"]) == (20, 20, 0, 0)
+    assert found["seconds"] > 0
+    assert set(found["cost"]) == {"worker", "all workers", "learner", "driver"}

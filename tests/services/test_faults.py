@@ -18,6 +18,7 @@ from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import WorkError
 from dmil_core.methods.dmil import Dmil
 from services import meta_train, reproduce
+from services.actors.simulation import SimulationWorker
 from services.checkpoints import Checkpoints
 from services.command_line import exit_code
 from services.demo_store import DemoStore, TaskDemonstrations
@@ -128,6 +129,27 @@ def test_a_slot_that_ends_its_workers_is_named(small: Experiment, data):
         piece = error.value.piece
         assert deadly.tasks(int(piece["iteration"]))[int(piece["slot"])] == "push"
         assert meta_training.state().iteration == piece["iteration"]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("joined")
+def test_a_trial_that_ends_its_workers_is_named(
+    train, workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    train("run", "--training.iterations", "1")
+
+    class Deadly(SimulationWorker):
+        def try_out(self, method, parameters, shapes, trial, held_out, evaluation, seed):
+            if trial.task == "push":
+                os.kill(os.getpid(), signal.SIGKILL)
+            return super().try_out(method, parameters, shapes, trial, held_out, evaluation, seed)
+
+    monkeypatch.setattr("services.ray_runner.SimulationWorker", Deadly)
+    assert exit_code(meta_train.run, ["--resume", "run", "--runner", "ray", "--workers", "2"]) == 1
+    said = capsys.readouterr().err
+    assert "meta-training task push, 1-shot, support set 0" in said
+    assert "3 workers ended in the course of it" in said
+    assert read_failure(Path("runs/run")).piece["task"] == "push"
 
 
 @pytest.fixture

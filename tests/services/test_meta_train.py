@@ -201,7 +201,7 @@ def descendants(session: str) -> list[psutil.Process]:
 def test_a_stopped_run_goes_on_with_the_same_bits(
     programs, train, wait_for, mlflow_file, workplace: Path, monkeypatch, runner: str, number: int, wanted: int
 ):
-    session = f"{runner}-{wanted}-{os.getpid()}"
+    session, shared = f"{runner}-{wanted}-{os.getpid()}", set(Path("/dev/shm").iterdir())
     monkeypatch.setenv("DMIL_TEST_SESSION", session)
     arguments = ["--preset", "ml10-smoke", "--runner", runner, "--name", "run", "--training.checkpoint-every", "5"]
     if runner == "ray":
@@ -216,6 +216,7 @@ def test_a_stopped_run_goes_on_with_the_same_bits(
     assert "Traceback" not in printed
     monkeypatch.delenv("DMIL_TEST_SESSION")
     wait_for(lambda: not descendants(session), f"the end of {descendants(session)}", 15)
+    assert set(Path("/dev/shm").iterdir()) <= shared
 
     stopped = checkpoints.newest()
     mlflow_run = json.loads((workplace / "runs" / "run" / "mlflow_run.json").read_text())["run_id"]
