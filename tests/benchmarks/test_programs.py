@@ -63,11 +63,12 @@ def test_scaling(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_tracking(tmp_path: Path) -> None:
     rows = rows_of("tracking", "--rounds", "1", "--iterations", "2", folder=tmp_path)
-    assert [row["mlflow"] for row in rows] == ["no tracking", "down", "slow", "up (SQLite)"]
-    none, down, slow, up = rows
-    assert (none["ratio"], none["records"]) == (1, 0)
+    assert [row["mlflow"] for row in rows] == ["no tracking", "down", "slow", "up (SQLite)", "no tracking, again"]
+    none, down, slow, up, again = rows
+    assert (none["ratio"], none["records"], again["records"]) == (1, 0, 0)
     for row in (down, slow, up):
         assert row["ratio"] > 0
+        assert row["call_us"] > 0
         assert row["records"] == 3 + 2 + 2, "iterations, and where the run begins and ends"
     assert [row["delivered"] for row in (down, slow, up)] == [0, 0, 7]
 
