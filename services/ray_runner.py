@@ -32,6 +32,8 @@ FAN_IN = 8
 """Gradients that one worker adds at a time, a power of two; it does not change the result."""
 LOSSES_ALLOWED = 10
 """So often may the learner, or a result that others build upon, be lost without an iteration more done."""
+SUSPICIONS_ALLOWED = 3
+"""So often may a block of slots be suspected to end its workers, while each of its slots alone ends none."""
 POLITENESS = 10
 """How far a simulation beside meta-training stands back, see `os.nice`."""
 
@@ -82,7 +84,8 @@ class RayRunner:
     @property
     def workers(self) -> int:
         """How many workers of each kind there may be now: nodes come and go."""
-        return min(self._asked_for or self._cpus(), self._cpus())
+        cpus = self._cpus()
+        return min(self._asked_for or cpus, cpus)
 
     def _cpus(self) -> int:
         return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
@@ -214,6 +217,7 @@ class RayMetaTraining:
         )
         self._kept, self._done, self._told = plan.state, plan.state.iteration, plan.state.iteration
         self._losses: Counter[int] = Counter()
+        self._suspicions: Counter[int] = Counter()
         self._ahead: Gradients | None = None
         self._start_learner()
         self._resume()
@@ -314,7 +318,7 @@ class RayMetaTraining:
             try:
                 for _ in self._run(self._told):
                     pass
-                self._kept = self._pool.result(self._pool.submit("state", on=self._learner))
+                self._kept = self._result(self._pool.submit("state", on=self._learner))
                 return self._kept
             except LostError as error:
                 self._recover(error)
@@ -331,18 +335,22 @@ class RayMetaTraining:
             try:
                 return self._pool.result(call)
             except DeadlyCallError as error:
-                self._blame(error.call)
+                self._blame(error)
 
-    def _blame(self, call: "Call") -> None:
-        if call.method == "gradient":
-            parameters, iteration, tasks, block, _ = call.arguments
-            for slot in (slot for group in block for slot in group):
-                where = slot_in_words(iteration, slot, tasks[slot], self._plan.seed)
-                alone = self._pool.submit("gradient", parameters, iteration, tasks, [[slot]], returns=2, label=where)
-                try:
-                    self._pool.result(alone)
-                except DeadlyCallError as error:
-                    raise WorkError(where, str(error), str(error), {"iteration": iteration, "slot": slot}) from error
+    def _blame(self, error: DeadlyCallError) -> None:
+        call = error.call
+        self._suspicions[call.number] += 1
+        if call.method != "gradient" or self._suspicions[call.number] > SUSPICIONS_ALLOWED:
+            raise error
+        parameters, iteration, tasks, block, _ = call.arguments
+        for slot in (slot for group in block for slot in group):
+            where = slot_in_words(iteration, slot, tasks[slot], self._plan.seed)
+            alone = self._pool.submit("gradient", parameters, iteration, tasks, [[slot]], returns=2, label=where)
+            try:
+                self._pool.result(alone)
+            except DeadlyCallError as own:
+                problem = f"{own.call.deaths} workers ended in the course of it, one after the other"
+                raise WorkError(where, problem, str(own), {"iteration": iteration, "slot": slot}) from own
         self._pool.retry(call)
 
     def _start_learner(self) -> None:
@@ -370,7 +378,11 @@ class RayMetaTraining:
             self._pool.drop()
             self._ahead = None
             try:
-                self._kept = self._pool.result(self._pool.submit("state", on=self._learner))
+                state: OuterState = self._pool.result(self._pool.submit("state", on=self._learner))
+                if state.iteration > self._told:  # a step further than its iteration was told of
+                    self._start_learner()
+                else:
+                    self._kept = state
                 self._resume()
                 break
             except LostError as again:
