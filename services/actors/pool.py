@@ -352,6 +352,7 @@ class Pool:
             elif of_twin:
                 self._let_spare_go(call)
             else:  # what it is built upon is queued again as well
+                self._let_spare_go(call)
                 self._take_from_worker(call)
                 self._queue(call)
             return
@@ -419,6 +420,7 @@ class Pool:
     def _let_spare_go(self, call: Call) -> None:
         if call.spare is not None:
             ray.kill(call.spare.actor)
+            self._starting = {up: worker for up, worker in self._starting.items() if worker is not call.spare}
             for reference in call.twin[:1]:
                 self._running.pop(reference, None)
             call.spare, call.twin, call.began = None, [], None
