@@ -111,8 +111,8 @@ def test_with_no_server_training_ends_and_a_flush_delivers(
 
 
 @pytest.fixture
-def slow_server() -> Iterator[str]:
-    """A server that waits ten seconds before each answer."""
+def slow_server() -> Iterator[tuple[str, threading.Event]]:
+    """The address of a server that waits ten seconds before each answer, and what ends the waiting."""
     over = threading.Event()
 
     class Slow(BaseHTTPRequestHandler):
@@ -128,15 +128,17 @@ def slow_server() -> Iterator[str]:
     server = ThreadingHTTPServer(("127.0.0.1", 0), Slow)
     server.daemon_threads = True
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield f"http://127.0.0.1:{server.server_address[1]}"
+    yield f"http://127.0.0.1:{server.server_address[1]}", over
     over.set()
     server.shutdown()
     server.server_close()
 
 
 @pytest.mark.slow
-def test_a_slow_server_is_not_waited_for(slow_server: str, tmp_path: Path, mlflow_file: str, monkeypatch):
-    monkeypatch.setenv("MLFLOW_TRACKING_URI", slow_server)
+def test_a_slow_server_is_not_waited_for(
+    slow_server: tuple[str, threading.Event], tmp_path: Path, mlflow_file: str, monkeypatch
+):
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", slow_server[0])
     tracker = Tracker(tmp_path, "slow", print)
     began = time.monotonic()
     for step in range(1, 101):
@@ -148,6 +150,7 @@ def test_a_slow_server_is_not_waited_for(slow_server: str, tmp_path: Path, mlflo
     began = time.monotonic()
     assert not tracker.close("FINISHED")
     assert time.monotonic() - began < 5
+    slow_server[1].set()
     tracker._thread.join(15)
 
     monkeypatch.setenv("MLFLOW_TRACKING_URI", mlflow_file)
