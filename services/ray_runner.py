@@ -22,7 +22,8 @@ from services.suites.base import TaskSuite
 from services.timing import Span, Timing
 
 if TYPE_CHECKING:
-    from services.actors.pool import Call, Pool
+    from services.actors.calls import Call
+    from services.actors.pool import Pool
 
 
 __all__ = ["FAN_IN", "RayMetaTraining", "RayRunner"]

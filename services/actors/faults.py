@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from dmil_core.errors import RunError, UserError
 
 if TYPE_CHECKING:
-    from services.actors.pool import Call
+    from services.actors.calls import Call
 
 __all__ = ["DeadlyCallError", "LostError", "NoRoomError"]
 

@@ -12,8 +12,9 @@ import pytest
 import ray
 
 from dmil_core.errors import RunError
+from services.actors.calls import Worker
 from services.actors.faults import DeadlyCallError, LostError
-from services.actors.pool import DEATHS_ALLOWED, Pool, Worker
+from services.actors.pool import DEATHS_ALLOWED, Pool
 
 
 @pytest.fixture
