@@ -34,13 +34,15 @@ __all__ = ["Arguments", "run"]
 
 VICTIMS = {"worker": 6, "all workers": 1, "learner": 2, "driver": 2}
 """What is killed, and how often against the others."""
-KILLS_PER_RUN = 10
+KILLS_PER_RUN = 20
 SETTINGS = (
-    "--preset", "ml10-smoke", "--workers", "2", "--training.iterations", "240", "--training.checkpoint-every", "20",
-    "--training.tasks-per-iteration", "4", "--evaluation.every", "80",
+    "--preset", "ml10-smoke", "--workers", "2", "--training.iterations", "480", "--training.checkpoint-every", "20",
+    "--training.tasks-per-iteration", "4", "--evaluation.every", "160",
 )  # fmt: skip
-SECONDS_BETWEEN = 3.0
-"""Mean time from one kill to the next."""
+SECONDS_BETWEEN = 1.5
+"""Mean time from one kill to the next, while a learner or a worker is there."""
+STARTING = 0.03
+"""How probable a kill then is in the seconds in which a program starts, when it alone is there."""
 RUN_SECONDS = 600.0
 """A run that takes longer counts as lost."""
 ATTEMPTS = 3
@@ -130,6 +132,8 @@ class Campaign:
         there: dict[str, list[Any]] = {"worker": workers[:], "learner": learners, "driver": [program]}
         there["all workers"] = workers if len(workers) > 1 else []
         kinds = [kind for kind in VICTIMS if there[kind]]
+        if kinds == ["driver"] and self._draw.random() > STARTING:
+            return None
         kind = self._draw.choices(kinds, [VICTIMS[kind] for kind in kinds])[0]
         if kind == "driver":
             left = _descendants(program)
