@@ -32,14 +32,14 @@ from services.progress import Bar, console
 
 __all__ = ["Arguments", "run"]
 
-VICTIMS = {"worker": 6, "all workers": 1, "learner": 2, "driver": 2}
+VICTIMS = {"worker": 7, "all workers": 1, "learner": 2, "driver": 1}
 """What is killed, and how often against the others."""
-KILLS_PER_RUN = 20
+KILLS_PER_RUN = 10
 SETTINGS = (
     "--preset", "ml10-smoke", "--workers", "2", "--training.iterations", "480", "--training.checkpoint-every", "20",
     "--training.tasks-per-iteration", "4", "--evaluation.every", "160",
 )  # fmt: skip
-SECONDS_BETWEEN = 1.5
+SECONDS_BETWEEN = 3.0
 """Mean time from one kill to the next, while a learner or a worker is there."""
 STARTING = 0.03
 """How probable a kill then is in the seconds in which a program starts, when it alone is there."""

@@ -221,7 +221,10 @@ class RayMetaTraining:
         self._suspicions: Counter[int] = Counter()
         self._ahead: Gradients | None = None
         self._start_learner()
-        self._resume()
+        try:
+            self._resume()
+        except LostError as error:
+            self._recover(error)
         self.alive = True
 
     def __len__(self) -> int:
