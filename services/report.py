@@ -52,7 +52,7 @@ def draw_curves(metrics: list[dict[str, float]], path: Path) -> None:
 
 
 def _draw_panel(axis: Axes, title: str, prefixes: tuple[str, ...], metrics: list[dict[str, float]]) -> None:
-    for name in (name for name in metrics[-1] if name.startswith(prefixes)):
+    for name in dict.fromkeys(name for row in metrics for name in row if name.startswith(prefixes)):
         rows = [row for row in metrics if name in row]
         size = -(-len(rows) // SMOOTHED)
         parts = [rows[first : first + size] for first in range(0, len(rows), size)]
@@ -61,7 +61,8 @@ def _draw_panel(axis: Axes, title: str, prefixes: tuple[str, ...], metrics: list
     axis.set(title=title, xlabel="iteration")
     if "share" not in title and "agreement" not in title:
         axis.set_yscale("symlog", linthresh=0.01)
-    axis.legend(fontsize="small")
+    if axis.lines:
+        axis.legend(fontsize="small")
 
 
 def write_report(summary: Summary, folder: Path) -> None:
