@@ -115,12 +115,9 @@ class Cluster(NamedTuple):
     dashboard: str
 
 
-@pytest.fixture(scope="session")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    """One `ray start --head` for the whole session, with room for three workers."""
+def start_head(folder: str, log: Path) -> tuple[subprocess.Popen[bytes], Cluster]:
+    """Start a Ray head, and wait until it answers or has ended."""
     port, dashboard_port = free_port(), free_port()
-    folder = tempfile.mkdtemp(prefix="dmil")  # Ray's sockets lie in it: a path of over 107 bytes is too long
-    log = tmp_path_factory.mktemp("ray") / "head.log"
     command = [
         sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block", "--num-cpus=3",
         "--node-ip-address=127.0.0.1", f"--port={port}", "--dashboard-host=127.0.0.1",
@@ -130,16 +127,24 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     ]  # fmt: skip
     with log.open("w") as output:
         head = subprocess.Popen(command, cwd=PROJECT, stdout=output, stderr=output)
-    try:
-        wait_for(
-            lambda: answers(f"http://127.0.0.1:{dashboard_port}/api/version") or head.poll() is not None, "ray start"
-        )
-        assert head.poll() is None, log.read_text()
-        yield Cluster(f"127.0.0.1:{port}", f"http://127.0.0.1:{dashboard_port}")
-    finally:
-        head.send_signal(signal.SIGTERM)
-        head.wait(30)
-        shutil.rmtree(folder, ignore_errors=True)
+    cluster = Cluster(f"127.0.0.1:{port}", f"http://127.0.0.1:{dashboard_port}")
+    wait_for(lambda: answers(f"{cluster.dashboard}/api/version") or head.poll() is not None, "ray start")
+    return head, cluster
+
+
+@pytest.fixture(scope="session")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    """One `ray start --head` for the whole session, with room for three workers."""
+    folder = tempfile.mkdtemp(prefix="dmil")  # Ray's sockets lie in it: a path of over 107 bytes is too long
+    log = tmp_path_factory.mktemp("ray") / "head.log"
+    head, cluster = start_head(folder, log)
+    if head.poll() is not None:  # somebody else was faster to take one of its ports
+        head, cluster = start_head(folder, log)
+    assert head.poll() is None, log.read_text()
+    yield cluster
+    head.send_signal(signal.SIGTERM)
+    head.wait(30)
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture
