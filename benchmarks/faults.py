@@ -28,6 +28,7 @@ from rich.table import Table
 from scipy.optimize import nnls
 
 from services.command_line import exit_code, parse
+from services.disk import write_file
 from services.progress import Bar, console
 
 __all__ = ["Arguments", "run"]
@@ -242,13 +243,9 @@ def run(arguments: Sequence[str]) -> None:
     )
     if given.json is not None:
         row = {"kills": counts.total(), **{name: counts[name] for name in ("equal", "lost", "different")}}
-        write_result(given.json, row | {"runs": len(outcomes), "seconds": undisturbed.seconds, "cost": costs})
-
-
-def write_result(path: Path, result: dict[str, Any]) -> None:
-    """Write the result as a JSON object."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(result, indent=1) + "\n")
+        row |= {"runs": len(outcomes), "seconds": undisturbed.seconds, "cost": costs}
+        given.json.parent.mkdir(parents=True, exist_ok=True)
+        write_file(given.json, json.dumps(row, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
 import json
 import os
+import shutil
 import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -150,7 +150,7 @@ def test_a_trial_that_ends_its_workers_is_named(
 
 
 @pytest.fixture
-def nodes(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nodes]:
+def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[Nodes]:
     folder = Path("/tmp") / f"dmil-{os.getpid()}"  # Ray's sockets lie in it: a path of over 107 bytes is too long
     (folder / "ray").mkdir(parents=True)
     monkeypatch.setenv("RAY_TMPDIR", str(folder))
@@ -159,7 +159,7 @@ def nodes(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFact
     monkeypatch.setenv("RAY_ADDRESS", str(nodes.address))
     yield nodes
     nodes.shutdown()
-    subprocess.run(["rm", "-rf", str(folder)], check=True)
+    shutil.rmtree(folder)
 
 
 @pytest.mark.slow
