@@ -5,7 +5,7 @@ import os
 import shutil
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -173,17 +173,24 @@ def test_nodes_may_leave_and_join(config: ExperimentConfig, store: DemoStore, da
         assert isinstance(meta_training, RayMetaTraining)
         up = [len(meta_training)]
 
+        def wait_for(condition: Callable[[], bool]) -> None:
+            until = time.monotonic() + 60
+            while not condition() and time.monotonic() < until:
+                time.sleep(0.2)
+
+        def joined() -> bool:
+            meta_training._pool.grow(runner.workers)
+            meta_training._pool.take_note()
+            return len(meta_training) == 4
+
         def change(done: int) -> None:
             if done == 1:
                 nodes.remove_node(leaving, allow_graceful=False)
-            if done == 2:
+                wait_for(lambda: runner.workers == 2)
+            if done == 3:  # what the lost worker was to do for the third was done by another
                 up.append(len(meta_training))
                 nodes.add_node(num_cpus=2, object_store_memory=100_000_000)
-                until = time.monotonic() + 60
-                while len(meta_training) < 4 and time.monotonic() < until:
-                    meta_training._pool.grow(runner.workers)
-                    meta_training._pool.take_note()
-                    time.sleep(0.2)
+                wait_for(joined)
                 up.append(len(meta_training))
 
         found = follow(meta_training, disturb=change)
