@@ -273,7 +273,7 @@ def one_policy(
     for task, found in demonstrations.items():
         env, seed = suite.make_env(task), 0
         while len(found) < DRAWS:
-            attempt = demonstrate(suite.expert(task), env, seed, EXPERT_STEPS, 0.1, TRAILING_STEPS)
+            attempt = demonstrate(suite.expert(task), env, seed, EXPERT_STEPS, config.demonstrations)
             if attempt.solved_at is not None:
                 found.append(Demonstration(str(seed), task, attempt.observations[:-1], attempt.actions))
             seed += 1

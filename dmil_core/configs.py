@@ -6,12 +6,14 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 __all__ = [
     "PRESETS",
+    "SIZES",
     "DemonstrationConfig",
     "DmilConfig",
     "EvaluationConfig",
     "ExperimentConfig",
     "SuiteConfig",
     "TrainingConfig",
+    "preset_of",
 ]
 
 Count = Annotated[int, Field(ge=1, le=10**9)]
@@ -33,38 +35,55 @@ class SuiteConfig(Settings):
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]*$")] = "ml10"
     """ml10 and ml45: Meta-World's own splits; ml10-reference: the one of the authors' released code; ML1-reach and the
-    like: one task; push-around-wall: the paper's new task after ml10's meta-training tasks (Figure 8)."""
+    like: one task; push-around-wall: the paper's new task after ml10's meta-training tasks (Figure 8);
+    kitchen-topburner, -microwave, -kettle and -slide: the Franka kitchen without that sub-task in meta-training
+    (Table 5); or what an installed package brings."""
     protocol: Literal["paper", "benchmark"] = "paper"
-    """Steps in an episode: 300, or 500 as in Meta-World's own evaluation. In both it is a success if the task is solved
-    at any of them."""
+    """Steps in an episode of Meta-World: 300, or 500 as in its own evaluation. In both it is a success if the task is
+    solved at any of them."""
     goal_visible: bool = True
     """Whether a policy sees where the goal is; Meta-World's own meta-learning benchmarks hide it."""
+    start_noise: NotNegative = 1.0
+    """How far the starts of a kitchen's episodes differ: 1 is as far as those of its real demonstrations."""
     horizon: Size | None = None
-    """Steps in an episode, if not the protocol's."""
+    """Steps in an episode, if not the suite's."""
     train_tasks: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     """Use these meta-training tasks instead of all of the suite's."""
     test_tasks: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     """Use these meta-testing tasks instead of all of the suite's."""
 
-    @property
-    def steps(self) -> int:
-        """Steps in an episode: the horizon if given, else the protocol's."""
-        return {"paper": 300, "benchmark": 500}[self.protocol] if self.horizon is None else self.horizon
+
+REFERENCE_LIMIT = 100
+REFERENCE_LIMITS = {"peg-unplug-side": 140, "bin-picking": 160}
+"""Most steps of a demonstration in the authors' released code, and the tasks that have more."""
 
 
 class DemonstrationConfig(Settings):
-    """How the scripted experts' demonstrations are collected."""
+    """Where demonstrations come from, and how the scripted experts make them."""
 
+    source: str = "expert"
+    """Where they come from: the suite's scripted experts, or minari:ID,ID, npz:PATH,PATH or hdf5:PATH,PATH, each the
+    data set of one task, which is named as TASK=ID, or else by the ID's last part."""
     per_task: Size = 100
-    """Demonstrations of each task, training and held-out ones together."""
+    """Demonstrations of each task, training and held-out ones together; of a source of one's own, at most so many."""
     held_out: Size = 20
     """Of these, how many are kept from meta-training, as support sets for evaluation."""
     noise: NotNegative = 0.1
-    """Standard deviation of the noise added to the executed action; the clean action is stored."""
+    """Standard deviation of the noise added to the action that the expert's environment executes."""
+    labels: Literal["clean", "noisy"] = "clean"
+    """Which action is stored: the expert's own, or the one with the noise, which was executed."""
     trailing_steps: Annotated[int, Field(ge=0, le=10**9)] = 10
     """Steps recorded after the task is solved."""
+    longest: Size | Literal["reference"] | None = None
+    """An attempt is given up after so many steps; reference: the limits of the authors' released code, 100 for most
+    tasks; none: the suite's horizon."""
     seed: Seed = 0
     """Names the demonstrations; they do not depend on the experiment's seed."""
+
+    def steps(self, task: str, horizon: int) -> int:
+        """Return after how many steps an attempt at `task` is given up."""
+        limit = REFERENCE_LIMITS.get(task, REFERENCE_LIMIT) if self.longest == "reference" else self.longest
+        return min(horizon, limit or horizon)
 
     @model_validator(mode="after")
     def _leave_some_for_training(self) -> "DemonstrationConfig":
@@ -172,9 +191,9 @@ class ExperimentConfig(Settings):
         return self
 
 
-PRESETS: dict[str, ExperimentConfig] = {
-    "ml10-paper": ExperimentConfig(),
-    "ml10-quick": ExperimentConfig(
+SIZES: dict[str, ExperimentConfig] = {
+    "paper": ExperimentConfig(),
+    "quick": ExperimentConfig(
         method=DmilConfig(
             hidden_layers=3,
             hidden_units=256,
@@ -190,8 +209,7 @@ PRESETS: dict[str, ExperimentConfig] = {
         ),
         evaluation=EvaluationConfig(learning_rate=3e-3),
     ),
-    "ml10-smoke": ExperimentConfig(
-        suite=SuiteConfig(train_tasks=("reach", "push", "drawer-close"), test_tasks=("door-close",)),
+    "smoke": ExperimentConfig(
         demonstrations=DemonstrationConfig(per_task=12, held_out=4),
         method=DmilConfig(hidden_units=32, hidden_layers=2, inner_learning_rate=1e-2, trajectories=2, window=24),
         training=TrainingConfig(
@@ -200,3 +218,38 @@ PRESETS: dict[str, ExperimentConfig] = {
         evaluation=EvaluationConfig(episodes=2, support_draws=1, fine_tuning_steps=5),
     ),
 }
+"""Presets by size: the paper's Table 9 to the letter; some minutes on two cores; a minute, to see that all works."""
+
+SMOKE_TASKS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "ml10": (("reach", "push", "drawer-close"), ("door-close",)),
+    "ml45": (("reach", "push", "drawer-close"), ("door-lock",)),
+    "push-around-wall": (("reach", "push"), ("push-around-wall",)),
+    "kitchen": (("microwave", "light"), ("topburner",)),
+    "kitchen-topburner": (("microwave", "light"), ("topburner",)),
+    "kitchen-microwave": (("light", "slide"), ("microwave",)),
+    "kitchen-kettle": (("microwave", "slide"), ("kettle",)),
+    "kitchen-slide": (("microwave", "light"), ("slide",)),
+}
+"""A few meta-training and meta-testing tasks of each suite, for the size smoke."""
+
+
+def preset_of(suite: str, size: str) -> ExperimentConfig:
+    """Return the settings of a size for a suite.
+
+    Raises:
+        KeyError: for a size that there is not.
+    """
+    config = SIZES[size]
+    changes: dict[str, Settings] = {"suite": SuiteConfig(name=suite)}
+    if size == "smoke" and suite in SMOKE_TASKS:
+        train, test = SMOKE_TASKS[suite]
+        changes["suite"] = SuiteConfig(name=suite, train_tasks=train, test_tasks=test)
+    if suite.startswith("kitchen"):
+        changes["method"] = config.method.model_copy(update={"sub_skills": 4})  # Table 5's middle column
+    return config.model_copy(update=changes)
+
+
+PRESETS: dict[str, ExperimentConfig] = {
+    f"{suite}-{size}": preset_of(suite, size) for suite in SMOKE_TASKS for size in SIZES
+}
+"""The settings of each size for each suite of the paper."""

@@ -1,13 +1,13 @@
-"""Success rates with their intervals, and how evenly sub-skills are used."""
+"""Success rates and scores with their intervals, and how evenly sub-skills are used."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import binomtest, entropy
+from scipy.stats import binomtest, entropy, t
 
-__all__ = ["Rate", "share_entropy", "success_rate"]
+__all__ = ["MeanScore", "Rate", "mean_score", "share_entropy", "success_rate"]
 
 
 class Rate(NamedTuple):
@@ -31,6 +31,33 @@ def success_rate(outcomes: Sequence[bool], confidence: float = 0.95) -> Rate:
     successes = sum(map(bool, outcomes))
     interval = binomtest(successes, len(outcomes)).proportion_ci(confidence, method="wilson")
     return Rate(successes, len(outcomes), successes / len(outcomes), float(interval.low), float(interval.high))
+
+
+class MeanScore(NamedTuple):
+    """A mean with its denominator, spread and interval, in the scores' own unit."""
+
+    episodes: int
+    mean: float
+    deviation: float | None
+    """Standard deviation over episodes; a single one has none, and no interval."""
+    low: float | None
+    high: float | None
+
+
+def mean_score(scores: Sequence[float], confidence: float = 0.95) -> MeanScore:
+    """Return the mean of `scores` with Student's interval.
+
+    Raises:
+        ValueError: without a single episode.
+    """
+    if not scores:
+        raise ValueError("scores: got no episode; a mean needs at least one")
+    mean, episodes = float(np.mean(scores)), len(scores)
+    if episodes == 1:
+        return MeanScore(1, mean, None, None, None)
+    deviation = float(np.std(scores, ddof=1))
+    half = float(t.ppf((1 + confidence) / 2, episodes - 1)) * deviation / episodes**0.5
+    return MeanScore(episodes, mean, deviation, mean - half, mean + half)
 
 
 def share_entropy(shares: Float[np.ndarray, " sub_skills"]) -> float:

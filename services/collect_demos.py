@@ -1,6 +1,8 @@
 """Let the scripted experts make the demonstrations of an experiment, and show what is in the store.
 
-What is there already is not made again.
+What is there already is not made again. With a word before all flags it does other things, each with a --help of its
+own: ``verify`` counts how often each expert does its task, ``inspect DATA`` looks into a data set, ``record`` stores
+rollouts of any policy as demonstrations.
 """
 
 import sys
@@ -14,7 +16,8 @@ import tyro
 from rich.table import Table
 
 from dmil_core.configs import ExperimentConfig
-from services.command_line import DEFAULT_PRESET, config_from, exit_code, parse, peek
+from services import inspect_demos, record_demos, verify_experts
+from services.command_line import DEFAULT_PRESET, defaults_from, exit_code, parse
 from services.demo_store import DemoStore, TaskDemonstrations, data_root
 from services.experiment import Experiment, RunnerKind, open_runner
 from services.progress import Clock, console
@@ -29,6 +32,10 @@ class Arguments:
     experiment: Annotated[ExperimentConfig, tyro.conf.arg(name="")]
     preset: str = DEFAULT_PRESET
     """Settings to begin with; those of suite and demonstrations count here."""
+    suite: str | None = None
+    """The suite, as ml10, ml45, ML1-reach, push-around-wall or kitchen; short for --suite.name."""
+    demos: str | None = None
+    """Where demonstrations come from, as minari:ID,TASK=ID; short for --demonstrations.source."""
     config: Path | None = None
     """YAML file of settings in the preset's place."""
     runner: RunnerKind = "ray"
@@ -37,11 +44,15 @@ class Arguments:
     """Ray workers, one for each CPU of the cluster if not given."""
 
 
+OTHERS = {"verify": verify_experts.run, "inspect": inspect_demos.run, "record": record_demos.run}
+
+
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
-    early = peek(arguments, preset=str, config=Path)
-    defaults = config_from(early.preset or DEFAULT_PRESET, early.config)
-    given = parse(Arguments, __doc__ or "", arguments, Arguments(defaults))
+    if arguments and arguments[0] in OTHERS:
+        OTHERS[arguments[0]](arguments[1:])
+        return
+    given = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(arguments)))
     store = DemoStore(data_root())
     experiment = Experiment(given.experiment, store)
     clock = Clock()

@@ -12,13 +12,14 @@ import tyro
 import yaml
 from pydantic import ValidationError
 
-from dmil_core.configs import PRESETS, EvaluationConfig, ExperimentConfig
+from dmil_core.configs import PRESETS, SIZES, EvaluationConfig, ExperimentConfig, preset_of
 from dmil_core.errors import RunError, UserError, explain, shown
 from services.disk import read_file
 
 __all__ = [
     "ConfigError",
     "config_from",
+    "defaults_from",
     "exit_code",
     "main",
     "parse",
@@ -27,7 +28,7 @@ __all__ = [
 ]
 
 T = TypeVar("T")
-DEFAULT_PRESET = "ml10-quick"
+DEFAULT_SUITE, DEFAULT_PRESET = "ml10", "quick"
 MOST_BYTES = 2**16
 """In a file of settings; PyYAML may need a second for so many."""
 DEEPEST = 20
@@ -44,15 +45,40 @@ class ConfigError(UserError):
     """A setting that is unknown or has an impossible value."""
 
 
-def config_from(preset: str, file: Path | None) -> ExperimentConfig:
+def defaults_from(arguments: Sequence[str]) -> ExperimentConfig:
+    """Return what ``--preset``, ``--suite``, ``--config`` and ``--demos`` in a program's arguments say all others are.
+
+    Raises:
+        ConfigError: as `config_from`, and for arguments that leave open what is meant.
+    """
+    early = peek(arguments, preset=str, suite=str, config=Path, demos=str)
+    config = config_from(early.preset or DEFAULT_PRESET, early.config, early.suite)
+    if early.demos is None:
+        return config
+    demonstrations = config.demonstrations.model_copy(update={"source": early.demos})
+    return config.model_copy(update={"demonstrations": demonstrations})
+
+
+def config_from(preset: str, file: Path | None, suite: str | None = None) -> ExperimentConfig:
     """Return a preset's settings, with those that a YAML file gives in their place.
+
+    Args:
+        preset: a size, or a suite and a size as ml10-quick.
+        file: of settings.
+        suite: in place of the preset's.
 
     Raises:
         ConfigError: names the key, what it got and what is allowed.
     """
-    if preset not in PRESETS:
-        raise ConfigError(f"--preset: got {preset!r}; wanted one of {', '.join(PRESETS)}")
-    settings = PRESETS[preset].model_dump()
+    named, _, size = preset.rpartition("-")
+    if size not in SIZES or (named and preset not in PRESETS):
+        raise ConfigError(
+            f"--preset: got {preset!r}; wanted {', '.join(SIZES)}, with --suite, or one of {', '.join(PRESETS)}"
+        )
+    try:
+        settings = preset_of(suite or named or DEFAULT_SUITE, size).model_dump()
+    except ValidationError as error:
+        raise ConfigError(f"--suite: got {shown(suite)}; wanted the name of a suite, as ml10") from error
     if file is not None:
         given = _read_yaml(file)
         if not isinstance(given, dict):

@@ -23,12 +23,12 @@ from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 from pydantic import BaseModel, Field, ValidationError
 
-from dmil_core.configs import DemonstrationConfig, SuiteConfig
+from dmil_core.configs import DemonstrationConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError, digest
 from dmil_core.errors import explain
 from services.digests import check_listing, write_listing
 from services.disk import inside, read_file, room_for, sync
-from services.suites.base import Attempt
+from services.suites.base import Attempt, TaskSuite
 
 __all__ = ["DemoStore", "TaskDemonstrations", "data_root"]
 
@@ -70,13 +70,11 @@ class DemoStore:
         self.root = root.resolve()
 
     @staticmethod
-    def dataset_id(task: str, suite: SuiteConfig, config: DemonstrationConfig) -> str:
+    def dataset_id(task: str, suite: TaskSuite, config: DemonstrationConfig) -> str:
         """Return the Minari id of a task's demonstrations: other settings, other id."""
-        settings = {"horizon": suite.steps, **config.model_dump(exclude={"held_out"})}
-        if not suite.goal_visible:
-            settings["goal_visible"] = False
+        settings = {"protocol": suite.protocol, **config.model_dump(exclude={"held_out", "source"})}
         key = hashlib.sha256(json.dumps([task, settings], sort_keys=True).encode()).hexdigest()[:10]
-        return f"{task}/scripted-{key}-v2"
+        return f"{suite.family}/{task}/scripted-{key}-v2"
 
     def load(self, dataset_id: str, task: str) -> TaskDemonstrations | None:
         """Read a task's demonstrations, or `None` if they are not collected yet.
@@ -114,7 +112,13 @@ class DemoStore:
         )
 
     def save(
-        self, dataset_id: str, task: str, successes: Sequence[Attempt], failed: int, settings: dict[str, Any]
+        self,
+        dataset_id: str,
+        task: str,
+        successes: Sequence[Attempt],
+        failed: int,
+        settings: dict[str, Any],
+        algorithm: str = "scripted expert",
     ) -> TaskDemonstrations:
         """Write a task's demonstrations beside, then rename: a data set is there whole, or not at all.
 
@@ -132,7 +136,7 @@ class DemoStore:
         metadata = {
             "dataset_id": dataset_id,
             "minari_version": minari.__version__,
-            "algorithm_name": "scripted expert",
+            "algorithm_name": algorithm,
             "description": "reward 1 at the step that solves the task for the first time, 0 elsewhere",
             "failed": failed,
             "digest": digest(demonstrations),
@@ -218,7 +222,7 @@ def _episode(attempt: Attempt) -> EpisodeBuffer:
     steps = len(attempt.actions)
     return EpisodeBuffer(
         seed=attempt.seed,
-        options={"goal": attempt.goal},
+        options={"goal": attempt.goal} if attempt.goal else None,
         observations=attempt.observations,  # type: ignore[arg-type]
         actions=attempt.actions,  # type: ignore[arg-type]
         rewards=[float(step == attempt.solved_at) for step in range(steps)],

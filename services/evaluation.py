@@ -87,7 +87,7 @@ class Evaluator:
             episodes += _episode_rows(row, trial, outcome)
             adaptations.append(_adaptation_row(row, outcome, self.config.method.sub_skills))
         failed = {task: dataset.failed for task, dataset in self._data.items()}
-        return Evaluation(checkpoint, self._suite.protocol, failed, episodes, adaptations)
+        return Evaluation(checkpoint, self._suite.protocol, self._suite.best_score, failed, episodes, adaptations)
 
     def _method(self, checkpoint: Checkpoint) -> Dmil:
         return Dmil.restored(self.config.method, self._suite.action_dim, checkpoint.constants)
@@ -163,7 +163,7 @@ class Evaluations:
         iteration = checkpoint.manifest.iteration
         evaluation = self._evaluator.evaluation(checkpoint, outcomes)
         write_evaluation(evaluation, self._folder / f"{iteration:07d}")
-        found = cells(evaluation.episodes)
+        found = cells(evaluation.episodes, evaluation.best_score, self._evaluator.config.method.sub_skills)
         self._tracker.metrics(iteration, rates(found, sub_skill_use(evaluation.adaptations)))
         in_words = "; ".join(f"{cell.split} {cell.shots}-shot {cell.success_rate:.3f}" for cell in found)
         console.print(f"success rates after {iteration} iterations: {in_words}")

@@ -23,11 +23,12 @@ from services.failures import keeping_failures
 from services.progress import Bar, console
 from services.provenance import library_versions
 from services.ray_runner import RayRunner
+from services.recordings import demonstrations, places_of
 from services.results import Split
 from services.rollouts import TrialOutcome
 from services.runners import Iteration, LocalRunner, Plan, Runner
 from services.suites.base import Attempt, TaskSuite
-from services.suites.metaworld import MetaWorldSuite
+from services.suites.registry import open_suite
 from services.summary import AGAINST_COLLAPSE, COLLAPSED, Evaluation
 from services.tracking import Tracker
 
@@ -114,15 +115,16 @@ class Experiment:
             store: where its demonstrations are, or will be.
         """
         self.config = config
-        self.suite: TaskSuite = MetaWorldSuite(config.suite)
+        self.suite: TaskSuite = open_suite(config.suite)
         self.store = store
 
     @property
     def tasks(self) -> list[tuple[Split, str]]:
-        """All tasks with their split."""
+        """All tasks with their split; one that is in both is a meta-testing task: its goals are unseen."""
+        test = self.suite.test_tasks
         return [
-            *(("meta-training", task) for task in self.suite.train_tasks),
-            *(("meta-testing", task) for task in self.suite.test_tasks),
+            *(("meta-training", task) for task in self.suite.train_tasks if task not in test),
+            *(("meta-testing", task) for task in test),
         ]
 
     # Demonstrations
@@ -134,23 +136,59 @@ class Experiment:
         simulates what.
 
         Raises:
-            DemonstrationError: if an expert hardly ever succeeds.
+            DemonstrationError: if an expert hardly ever succeeds, a task has none, or a data set cannot be used.
         """
-        names = dict.fromkeys(task for _, task in self.tasks)
-        ids = {task: self.store.dataset_id(task, self.config.suite, self.config.demonstrations) for task in names}
-        found = {task: self.store.load(dataset_id, task) for task, dataset_id in ids.items()}
-        if missing := [task for task, dataset in found.items() if dataset is None]:
+        names = list(dict.fromkeys(task for _, task in self.tasks))
+        settings = self.config.demonstrations
+        found = self._recorded(names)
+        ids = {task: self.store.dataset_id(task, self.suite, settings) for task in names if task not in found}
+        missing = []
+        for task, dataset_id in ids.items():
+            if (dataset := self.store.load(dataset_id, task)) is not None:
+                found[task] = dataset
+            elif self.suite.expert(task) is None:
+                raise DemonstrationError(
+                    f"demonstrations.source: got nothing for {task}, which has no scripted expert; wanted a data set: "
+                    f"--demos minari:{task}=ID"
+                )
+            else:
+                missing.append(task)
+        if missing:
             for task, attempts in self._attempt(runner, missing).items():
                 solved = [index for index, attempt in enumerate(attempts) if attempt.solved_at is not None]
-                kept = solved[: self.config.demonstrations.per_task]
+                kept = solved[: settings.per_task]
                 found[task] = self.store.save(
                     ids[task],
                     task,
                     [attempts[index] for index in kept],
                     failed=kept[-1] + 1 - len(kept),
-                    settings=self.config.demonstrations.model_dump(),
+                    settings={"protocol": self.suite.protocol, **settings.model_dump()},
                 )
-        return {task: dataset for task, dataset in found.items() if dataset is not None}
+        return {task: found[task] for task in names}
+
+    def _recorded(self, names: Sequence[str]) -> dict[str, TaskDemonstrations]:
+        """Return the demonstrations of those tasks that the settings name a data set for."""
+        settings, evaluation = self.config.demonstrations, self.config.evaluation
+        if settings.source == "expert":
+            return {}
+        places = places_of(settings.source)
+        if unknown := [task for task in places if task not in names]:
+            raise DemonstrationError(
+                f"demonstrations.source: got data sets of {', '.join(unknown)}; {self.suite.name} has the tasks "
+                f"{', '.join(names)}; name the task that a data set is of: TASK=ID"
+            )
+        found = {task: demonstrations(task, place, self.suite, settings.per_task) for task, place in places.items()}
+        support = max(evaluation.shots) * evaluation.support_draws
+        for task, dataset in found.items():
+            wanted = settings.held_out + 1 if task in self.suite.train_tasks else support
+            if (got := len(dataset.demonstrations)) < wanted:
+                raise DemonstrationError(
+                    f"{dataset.id}: got {got} demonstrations of {task}; wanted at least {wanted}: {support} for "
+                    f"{evaluation.support_draws} support sets of {max(evaluation.shots)}, and for a meta-training task "
+                    "one more than demonstrations.held_out; record more, or lower that, evaluation.shots or "
+                    "evaluation.support_draws"
+                )
+        return found
 
     def _attempt(self, runner: Runner, tasks: Sequence[str]) -> dict[str, list[Attempt]]:
         """Return each task's attempts, in the order of their numbers, with enough successes among them."""

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import explain, shown
 from services.checkpoints import Checkpoint, CheckpointError, Checkpoints
-from services.command_line import DEFAULT_PRESET, ConfigError, config_from, exit_code, parse, peek
+from services.command_line import DEFAULT_PRESET, ConfigError, defaults_from, exit_code, parse, peek
 from services.demo_store import DemoStore, data_root
 from services.disk import inside, read_file, write_file
 from services.experiment import Experiment, OnNonfinite, RunnerKind, open_runner
@@ -40,7 +40,12 @@ class Arguments:
 
     experiment: Annotated[ExperimentConfig, tyro.conf.arg(name="")]
     preset: str = DEFAULT_PRESET
-    """Settings to begin with: ml10-quick, ml10-paper (Table 9 to the letter) or ml10-smoke."""
+    """Settings to begin with: quick (some minutes on two cores), paper (Table 9 to the letter) or smoke (a minute);
+    also with the suite's name before, as ml10-quick."""
+    suite: str | None = None
+    """The suite, as ml10, ml45, ML1-reach, push-around-wall or kitchen; short for --suite.name."""
+    demos: str | None = None
+    """Where demonstrations come from, as minari:ID,TASK=ID; short for --demonstrations.source."""
     config: Path | None = None
     """YAML file of settings in the preset's place, for example `method: {sub_skills: 5}`."""
     runner: RunnerKind = "ray"
@@ -105,17 +110,18 @@ def run(arguments: Sequence[str]) -> None:
 
 def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]:
     """Return the arguments, the run's folder, and the checkpoint to go on from."""
-    early = peek(arguments, preset=str, config=Path, resume=str, runs=Path)
+    early = peek(arguments, resume=str, runs=Path, preset=str, config=Path, suite=str, demos=str)
     if early.resume is None:
-        defaults = config_from(early.preset or DEFAULT_PRESET, early.config)
-        given = parse(Arguments, __doc__ or "", arguments, Arguments(defaults))
-        folder = _new_run(given.name or f"{given.preset}-{datetime.now():%Y%m%d-%H%M%S}", given.runs)
+        given = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(arguments)))
+        kind = "-".join(filter(None, (given.suite, given.preset)))
+        folder = _new_run(given.name or f"{kind}-{datetime.now():%Y%m%d-%H%M%S}", given.runs)
         if (folder / "config.json").exists():
             raise ConfigError(f"--name: got {folder}, which holds a run; wanted a new name, or --resume {folder}")
         return given, folder, None
-    if early.preset or early.config:
+    if early.preset or early.config or early.suite or early.demos:
         raise ConfigError(
-            "--resume: got --preset or --config with it; wanted neither: a run goes on with its own settings"
+            "--resume: got --preset, --config, --suite or --demos with it; wanted none: a run goes on with its own "
+            "settings"
         )
     folder = _find_run(early.resume, early.runs or Arguments.runs)
     try:

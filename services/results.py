@@ -53,6 +53,8 @@ class EpisodeResult(_Row):
     goal: tuple[float, ...]
     """What the environment drew from the seed."""
     success: bool
+    score: int
+    """Sub-tasks done in suites that count them, else 1 for a success."""
     steps: int
     sub_skill_steps: tuple[int, ...]
     """How many steps each sub-skill acted."""

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from gymnasium.spaces import Box
 
-from dmil_core.configs import EvaluationConfig
+from dmil_core.configs import DemonstrationConfig, EvaluationConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import FineTuning, Method, Policy, SubSkillUse
 from dmil_core.networks import Parameters
@@ -47,6 +47,8 @@ class Episode(NamedTuple):
     seed: int
     goal: list[float]
     success: bool
+    score: int
+    """The best of the episode: sub-tasks done in suites that count them, else 1 for a success."""
     steps: int
     sub_skill_steps: list[int]
     """How many steps each sub-skill acted, up to the highest one that did."""
@@ -61,11 +63,11 @@ def rollout(policy: Policy, envs: Sequence[Environment], seeds: Sequence[int], h
     action is not finite, fails there and then.
     """
     resets = [env.reset(seed=seed) for env, seed in zip(envs, seeds, strict=True)]
-    goals = [info["goal"] for _, info in resets]
+    goals = [info.get("goal", []) for _, info in resets]
     observations = np.array([observation for observation, _ in resets], np.float32)
     alive = np.arange(len(seeds))
     memory = policy.start(len(seeds))
-    success = np.zeros(len(seeds), bool)
+    success, score = np.zeros(len(seeds), bool), np.zeros(len(seeds), int)
     choices: list[list[int]] = [[] for _ in seeds]
     for _ in range(horizon):
         decision = policy.act(observations[alive], memory)
@@ -74,40 +76,46 @@ def rollout(policy: Policy, envs: Sequence[Environment], seeds: Sequence[int], h
         for index, action, sub_skill in zip(acting, actions, decision.sub_skills[finite].tolist(), strict=True):
             observations[index], _, _, _, info = envs[index].step(action)
             success[index] = info["success"]
+            score[index] = max(score[index], info.get("score", info["success"]))
             choices[index].append(sub_skill)
         going_on = ~success[alive] & finite
         alive, memory = alive[going_on], decision.memory[going_on]
         if not len(alive):
             break
     return [
-        Episode(seed, goal, bool(done), len(chosen), np.bincount(chosen).tolist())
-        for seed, goal, done, chosen in zip(seeds, goals, success, choices, strict=True)
+        Episode(seed, goal, bool(done), int(best), len(chosen), np.bincount(chosen).tolist())
+        for seed, goal, done, best, chosen in zip(seeds, goals, success, score, choices, strict=True)
     ]
 
 
-def demonstrate(
-    expert: Expert, env: Environment, seed: int, horizon: int, noise: float, trailing_steps: int
-) -> Attempt:
-    """Let an expert try once, and record what it saw and did until `trailing_steps` after its first success.
+def demonstrate(expert: Expert, env: Environment, seed: int, horizon: int, config: DemonstrationConfig) -> Attempt:
+    """Let an expert try once, and record what it saw and did until some steps after its first success.
 
     The environment executes the expert's action plus N(0, noise²), as in the authors' code; the action without the
-    noise is what is stored, clipped to the action space as the environment clips it.
+    noise is what is stored unless `config` says otherwise, clipped to the action space as the environment clips it.
+
+    Args:
+        expert: of the task.
+        env: of the task.
+        seed: of the episode.
+        horizon: the attempt is given up after so many steps.
+        config: noise, labels and trailing steps.
     """
     disturbance = stream(seed, "expert noise")
     observation, info = env.reset(seed=seed)
-    goal = info["goal"]
+    goal = info.get("goal", [])
     observations, actions = [observation], []
     solved_at, end = None, horizon
     while len(actions) < end:
         # A copy: some of Meta-World's experts add offsets to the positions in place.
         action = _clip(expert.get_action(info.get("full_observation", observation).copy()), env)
-        actions.append(action)
-        executed = _clip(action + disturbance.normal(0, noise, action.shape), env)
+        executed = _clip(action + disturbance.normal(0, config.noise, action.shape), env)
+        actions.append(executed if config.labels == "noisy" else action)
         observation, _, _, _, info = env.step(executed.astype(np.float32))
         observations.append(observation)
         if info["success"] and solved_at is None:
             solved_at = len(actions) - 1
-            end = min(horizon, len(actions) + trailing_steps)
+            end = min(horizon, len(actions) + config.trailing_steps)
     return Attempt(seed, goal, solved_at, np.asarray(observations, np.float32), np.asarray(actions, np.float32))
 
 

@@ -10,16 +10,17 @@ import numpy as np
 from pydantic import BaseModel
 from rich.table import Table
 
-from dmil_core.statistics import Rate, share_entropy, success_rate
+from dmil_core.statistics import Rate, mean_score, share_entropy, success_rate
 from services.checkpoints import Checkpoint
+from services.published import Published, dmil_figure
 from services.results import AdaptationResult, EpisodeResult, Split
 
 __all__ = [
     "AGAINST_COLLAPSE",
     "COLLAPSED",
-    "PAPER",
     "Cell",
     "Evaluation",
+    "Score",
     "SubSkillUse",
     "Summary",
     "cells",
@@ -31,13 +32,8 @@ __all__ = [
     "write_summary",
 ]
 
-PAPER: dict[tuple[str, Split, int], float] = {
-    ("ml10", "meta-training", 1): 0.775,
-    ("ml10", "meta-training", 3): 0.949,
-    ("ml10", "meta-testing", 1): 0.396,
-    ("ml10", "meta-testing", 3): 0.710,
-}
-"""DMIL in Table 4, K = 3: by suite, split and shots."""
+BEST = 5
+"""So many of a task's episodes count in the authors' own figure for the kitchen."""
 COLLAPSED = 0.99
 """A sub-skill with more of the states than this leaves nothing to the others."""
 AGAINST_COLLAPSE = (
@@ -51,9 +47,26 @@ class Evaluation(NamedTuple):
 
     checkpoint: Checkpoint
     protocol: str
+    best_score: int
+    """Of an episode in which all is done, see `TaskSuite`."""
     failed_attempts: dict[str, int]
     episodes: list[EpisodeResult]
     adaptations: list[AdaptationResult]
+
+
+class Score(BaseModel):
+    """Sub-tasks done in an episode."""
+
+    best: int
+    """Of an episode in which all are done."""
+    mean: float
+    deviation: float | None
+    """Standard deviation over episodes; a single one has none, and no interval."""
+    low: float | None
+    high: float | None
+    mean_of_best: float
+    """The mean of the five best episodes of each task, which the authors' script prints."""
+    per_task: dict[str, float]
 
 
 class Cell(BaseModel):
@@ -67,8 +80,10 @@ class Cell(BaseModel):
     low: float
     high: float
     per_task: dict[str, float]
-    paper: float | None
-    """The figure in Table 4, where it has one."""
+    score: Score | None
+    """In suites that count sub-tasks."""
+    paper: Published | None
+    """The paper's success rate for DMIL, or its score where there are scores."""
 
 
 class SubSkillUse(BaseModel):
@@ -100,8 +115,14 @@ class Summary(BaseModel):
     """Attempts of each task's expert that were no success and so no demonstration."""
 
 
-def cells(episodes: Sequence[EpisodeResult]) -> list[Cell]:
-    """Return one cell for each split and size of support set, with Wilson intervals."""
+def cells(episodes: Sequence[EpisodeResult], best_score: int, sub_skills: int) -> list[Cell]:
+    """Return one cell for each split and size of support set, with Wilson intervals.
+
+    Args:
+        episodes: all rows.
+        best_score: of an episode in which all is done; where it is more than 1, scores are given too.
+        sub_skills: K, by which the paper's figures differ.
+    """
     key = attrgetter("suite", "split", "shots")
     found = []
     for (suite, split, shots), group in groupby(sorted(episodes, key=key), key=key):
@@ -119,10 +140,27 @@ def cells(episodes: Sequence[EpisodeResult]) -> list[Cell]:
                 low=rate.low,
                 high=rate.high,
                 per_task=per_task,
-                paper=PAPER.get((suite, split, shots)),
+                score=_score(rows, best_score) if best_score > 1 else None,
+                paper=dmil_figure(suite, split, shots, sub_skills),
             )
         )
     return sorted(found, key=lambda cell: (cell.suite, cell.split == "meta-testing", cell.shots))
+
+
+def _score(rows: Sequence[EpisodeResult], best: int) -> Score:
+    mean = mean_score([float(row.score) for row in rows])
+    by_task: dict[str, list[int]] = {}
+    for row in rows:
+        by_task.setdefault(row.task, []).append(row.score)
+    return Score(
+        best=best,
+        mean=mean.mean,
+        deviation=mean.deviation,
+        low=mean.low,
+        high=mean.high,
+        mean_of_best=float(np.mean([np.mean(sorted(scores)[-BEST:]) for scores in by_task.values()])),
+        per_task={task: float(np.mean(scores)) for task, scores in by_task.items()},
+    )
 
 
 def sub_skill_use(adaptations: Sequence[AdaptationResult]) -> dict[Split, SubSkillUse]:
@@ -151,6 +189,10 @@ def rates(rows: Sequence[Cell], use: Mapping[Split, SubSkillUse]) -> dict[str, f
         found |= {f"success_rate/{name}": cell.success_rate, f"success_rate_low/{name}": cell.low}
         found |= {f"success_rate_high/{name}": cell.high, f"episodes/{name}": float(cell.episodes)}
         found |= {f"task_success_rate/{name}/{task}": rate for task, rate in cell.per_task.items()}
+        if cell.score is not None:
+            found |= {f"score/{name}": cell.score.mean, f"score_best_{BEST}/{name}": cell.score.mean_of_best}
+            if cell.score.low is not None and cell.score.high is not None:
+                found |= {f"score_low/{name}": cell.score.low, f"score_high/{name}": cell.score.high}
     for split, figures in use.items():
         found |= {f"agreement/{split}": figures.agreement, f"sub_skill_entropy/{split}": figures.entropy}
     return found
@@ -160,12 +202,13 @@ def summarise(
     evaluation: Evaluation, *, seconds: dict[str, float], folder: Path, mlflow_run_id: str | None = None
 ) -> Summary:
     """Return the summary of an evaluation whose report is to lie in `folder`."""
+    config = evaluation.checkpoint.manifest.config
     return Summary(
-        rows=cells(evaluation.episodes),
+        rows=cells(evaluation.episodes, evaluation.best_score, config.method.sub_skills),
         seconds=seconds,
         sub_skills=sub_skill_use(evaluation.adaptations),
         protocol=evaluation.protocol,
-        seed=evaluation.checkpoint.manifest.config.seed,
+        seed=config.seed,
         checkpoint=str(evaluation.checkpoint.path),
         checkpoint_digest=evaluation.checkpoint.digest,
         report=str(folder / "report"),
@@ -176,30 +219,54 @@ def summarise(
 
 def table(summary: Summary) -> Table:
     """Lay the summary out for the terminal."""
+    head, *rows = _table(summary)
     view = Table(title=f"Success rates ({summary.protocol}; seed {summary.seed})")
-    for column in ("suite", "split", "shots", "successes", "success rate", "95% interval", "paper, Table 4"):
+    for column in head:
         view.add_column(column, justify="left" if column in ("suite", "split") else "right")
-    for cell in summary.rows:
-        view.add_row(*_fields(cell))
+    for row in rows:
+        view.add_row(*row)
     return view
 
 
 def table_markdown(summary: Summary) -> str:
-    """Lay the summary out as Markdown, with the success rate of each task below."""
-    head = ("suite", "split", "shots", "successes", "success rate", "95% interval", "paper, Table 4")
-    lines = [_row(head), _row(["---"] * len(head)), *(_row(_fields(cell)) for cell in summary.rows)]
+    """Lay the summary out as Markdown, with the success rate, and the score if there is one, of each task below."""
+    head, *rows = _table(summary)
+    lines = [_row(head), _row(["---"] * len(head)), *map(_row, rows)]
     for split in dict.fromkeys(cell.split for cell in summary.rows):
         cells = [cell for cell in summary.rows if cell.split == split]
         lines += ["", _row(["task", *(f"{cell.shots}-shot" for cell in cells)]), _row(["---"] * (len(cells) + 1))]
-        lines += [_row([task, *(f"{cell.per_task[task]:.2f}" for cell in cells)]) for task in sorted(cells[0].per_task)]
+        lines += [_row([task, *(_of_task(cell, task) for cell in cells)]) for task in sorted(cells[0].per_task)]
     return f"Protocol: {summary.protocol}; seed {summary.seed}.\n\n" + "\n".join(lines) + "\n"
+
+
+def _table(summary: Summary) -> list[list[str]]:
+    """Return head and rows; columns that no row has anything in are left out."""
+    columns = ["suite", "split", "shots", "successes", "success rate", "95% interval"]
+    columns += ["score", "95% interval of the score", f"best {BEST} of each task", "paper"]
+    rows = [_fields(cell) for cell in summary.rows]
+    kept = [index for index in range(len(columns)) if any(row[index] for row in rows)]
+    return [[fields[index] for index in kept] for fields in (columns, *rows)]
 
 
 def _fields(cell: Cell) -> list[str]:
     successes = f"{round(cell.success_rate * cell.episodes)}/{cell.episodes}"
-    interval = f"{cell.low:.3f} to {cell.high:.3f}"
-    paper = "" if cell.paper is None else f"{cell.paper:.3f}"
-    return [cell.suite, cell.split, str(cell.shots), successes, f"{cell.success_rate:.3f}", interval, paper]
+    fields = [cell.suite, cell.split, str(cell.shots), successes, f"{cell.success_rate:.3f}"]
+    fields.append(f"{cell.low:.3f} to {cell.high:.3f}")
+    if (score := cell.score) is None:
+        fields += ["", "", ""]
+    elif score.low is None or score.high is None:
+        fields += [f"{score.mean:.2f} of {score.best}", "", f"{score.mean_of_best:.2f}"]
+    else:
+        fields += [f"{score.mean:.2f} ± {score.deviation:.2f} of {score.best}", f"{score.low:.2f} to {score.high:.2f}"]
+        fields.append(f"{score.mean_of_best:.2f}")
+    paper = cell.paper
+    digits = 3 if cell.score is None else 2
+    return [*fields, "" if paper is None else f"{paper.value:.{digits}f} ± {paper.spread:.{digits}f} ({paper.table})"]
+
+
+def _of_task(cell: Cell, task: str) -> str:
+    score = "" if cell.score is None else f", score {cell.score.per_task[task]:.2f}"
+    return f"{cell.per_task[task]:.2f}{score}"
 
 
 def _row(fields: Sequence[str]) -> str:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 
+from dmil_core.configs import DemonstrationConfig
 from services.rollouts import demonstrate
 from services.suites.base import TaskSuite
 
@@ -49,10 +50,10 @@ def verify(suite: TaskSuite, task: str, seeds: Iterable[int], noise: float) -> l
     expert = suite.expert(task)
     if expert is None:
         raise ValueError(f"task: got {task} of {suite.name}; wanted one that has a scripted expert")
-    env = _BestScore(suite.make_env(task))
+    env, config = _BestScore(suite.make_env(task)), DemonstrationConfig(noise=noise, trailing_steps=0)
     rows = []
     for seed in seeds:
-        attempt = demonstrate(expert, env, seed, suite.horizon, noise, trailing_steps=0)
+        attempt = demonstrate(expert, env, seed, suite.horizon, config)
         rows.append(VerificationRow(task, seed, noise, attempt.solved_at is not None, env.best, len(attempt.actions)))
     env.close()
     return rows

@@ -34,6 +34,8 @@ FLOORS = {
     "services.tracking.__main__": 7,
     "services.progress": 3,
     "services.provenance": 3,
+    "services.published": 3,
+    "services.recordings": 3,
     "services.results": 3,
     "services.timing": 3,
     "services.rollouts": 4,

@@ -15,6 +15,7 @@ from dmil_core.networks import unflatten
 from dmil_core.seeding import stream_seed
 from services.rollouts import Trial, TrialOutcome, demonstrate, try_out
 from services.suites.base import Attempt, Environment, TaskSuite
+from services.verification import VerificationRow, verify
 
 __all__ = ["SimulationWorker", "piece_of_call"]
 
@@ -50,14 +51,21 @@ class SimulationWorker:
         """
         (env, *_), expert = self._environments(task, 1), self._suite.expert(task)
         assert expert is not None
-        attempts = []
+        steps, attempts = config.steps(task, self._suite.horizon), []
         for number in numbers:
             seed = stream_seed(config.seed, "demonstration", task, number)
             with piece_of_work(f"task {task}, attempt {number}, seed {seed}", task=task, attempt=number):
-                attempts.append(
-                    demonstrate(expert, env, seed, self._suite.horizon, config.noise, config.trailing_steps)
-                )
+                attempts.append(demonstrate(expert, env, seed, steps, config))
         return attempts
+
+    def verify(self, task: str, seeds: Sequence[int], noise: float) -> list[VerificationRow]:
+        """Let the expert try once for each seed, see `services.verification`.
+
+        Raises:
+            WorkError: for a Python error in one of them.
+        """
+        with piece_of_work(f"task {task}, seeds {seeds[0]} to {seeds[-1]}", task=task, seed=seeds[0]):
+            return verify(self._suite, task, seeds, noise)
 
     def try_out(
         self,
@@ -85,5 +93,8 @@ def piece_of_call(method: str, arguments: Sequence[Any]) -> tuple[str, dict[str,
     if method == "attempts":
         task, numbers, _ = arguments
         return f"task {task}, attempts {numbers[0]} to {numbers[-1]}", {"task": task, "attempt": numbers[0]}
+    if method == "verify":
+        task, seeds, _ = arguments
+        return f"task {task}, seeds {seeds[0]} to {seeds[-1]}", {"task": task, "seed": seeds[0]}
     trial: Trial = arguments[3]
     return trial.in_words, trial.piece

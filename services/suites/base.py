@@ -9,9 +9,11 @@ from jaxtyping import Float32, Float64
 __all__ = ["Attempt", "Environment", "Expert", "TaskSuite"]
 
 Environment = gymnasium.Env[np.ndarray, np.ndarray]
-"""A task's environment. ``reset(seed=n)`` twice gives the same episode twice, and its info holds under ``goal`` what
-it drew at random; ``info["success"]`` of a step says whether the task is solved. Where observations leave out something
-that the expert needs, the infos of resets and steps hold the whole ones under ``full_observation``."""
+"""A task's environment, with a flat observation and actions in a `Box`. ``reset(seed=n)`` twice gives the same episode
+twice. ``info["success"]`` of a step says whether the task is solved. The infos of resets may hold under ``goal``, a
+list of numbers, what was drawn at random. Where there is a score, the infos of steps hold it under ``score``. Where
+observations leave out something that the expert needs, the infos of resets and steps hold the whole ones under
+``full_observation``."""
 
 
 class Expert(Protocol):
@@ -34,17 +36,31 @@ class Attempt(NamedTuple):
 
 
 class TaskSuite(Protocol):
-    """Meta-training and meta-testing tasks of one kind of robot."""
+    """Meta-training and meta-testing tasks of one kind of robot.
+
+    Besides what is listed, a suite may have:
+
+    - ``state_of(recorded)``: the observations (steps, `obs_dim`) in recorded ones (steps, any dimensions), for data
+      sets that hold more, or another form;
+    - ``replay(demonstration)``: what its actions lead to, in words;
+    - ``expert_tasks``: the tasks whose experts are verified, where those are not the tasks of both splits.
+    """
 
     name: str
+    """Of the split; results of different ones are never averaged."""
+    family: str
+    """Names the robot and its simulator: suites of one family and one protocol share the demonstrations of a task."""
     train_tasks: tuple[str, ...]
     test_tasks: tuple[str, ...]
     obs_dim: int
     action_dim: int
     horizon: int
     """Steps in an episode."""
+    best_score: int
+    """The score of an episode in which all is done: 1 where there is success or none, else the number of sub-tasks."""
     protocol: str
-    """Names the rule by which an episode counts as a success; rows of different protocols are never compared."""
+    """Names all that an episode depends on besides task and seed, and the rule by which it counts as a success; rows
+    of different protocols are never compared."""
 
     def make_env(self, task: str) -> Environment:
         """Build a task's environment; it may be reset and reused for any number of episodes."""

@@ -2,7 +2,7 @@
 
 import contextlib
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
 
@@ -11,7 +11,8 @@ import numpy as np
 from gymnasium.spaces import Box
 from jaxtyping import Float32, Float64
 
-from dmil_core.demonstrations import Demonstration
+from dmil_core.configs import SuiteConfig
+from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.errors import UserError
 from services.suites.base import Environment, Expert
 from services.suites.kitchen_expert import KitchenExpert
@@ -57,6 +58,9 @@ The paper names the sub-task that meta-training lacks and the chain that is test
 here they are all 15 chains of four of the other six sub-tasks.
 """
 
+DEFAULT_SPLIT = "kitchen-topburner"
+HORIZON = 280
+"""Steps in an episode, as in the paper."""
 START_ANGLE = 0.05
 """Radians by which each arm joint's first angle may differ from the environment's: the first states of the real
 demonstrations have standard deviations of 0.01 to 0.08."""
@@ -121,43 +125,43 @@ class KitchenTask(gymnasium.Env[np.ndarray, np.ndarray]):
         self._env.close()
 
 
-def state(observation: Float64[np.ndarray, "59"]) -> Float64[np.ndarray, "30"]:
+def state(observation: Float64[np.ndarray, "*steps 59"]) -> Float64[np.ndarray, "*steps 30"]:
     """Return the paper's state: the robot's 9 positions and the objects' 21, without velocities."""
-    return np.concatenate([observation[:9], observation[18:39]])
+    return np.concatenate([observation[..., :9], observation[..., 18:39]], axis=-1)
 
 
 class KitchenSuite:
     """Chains in a split; an episode is a success if every sub-task was done at some step within the horizon."""
 
+    family = "kitchen"
     obs_dim = 30
     action_dim = 9
 
-    def __init__(
-        self,
-        name: str = "kitchen-topburner",
-        *,
-        train_tasks: Iterable[str] | None = None,
-        test_tasks: Iterable[str] | None = None,
-        horizon: int = 280,
-        start_noise: float = 1.0,
-    ) -> None:
+    def __init__(self, config: SuiteConfig) -> None:
         """Take a split of `SPLITS`, or some other chains in place of its own.
 
         Raises:
-            UnknownKitchenTaskError: for a split or a sub-task that is not there, or a sub-task named twice.
+            UnknownKitchenTaskError: for a split or a sub-task that is not there, or a sub-task named twice, or a
+                setting that the kitchen does not have.
         """
+        name = DEFAULT_SPLIT if config.name.lower() == "kitchen" else config.name.lower()
         if name not in SPLITS:
-            raise UnknownKitchenTaskError(f"suite.name: got {name}; wanted one of {', '.join(SPLITS)}")
+            raise UnknownKitchenTaskError(f"suite.name: got {config.name}; wanted kitchen or {', '.join(SPLITS)}")
+        if config.protocol != "paper" or not config.goal_visible:
+            field = "goal_visible: got False" if config.protocol == "paper" else f"protocol: got {config.protocol}"
+            raise UnknownKitchenTaskError(f"suite.{field}; that is Meta-World's; leave it out for {name}")
         train, test = SPLITS[name]
-        self.name = name if train_tasks is test_tasks is None else f"{name}-part"
-        self.train_tasks = train if train_tasks is None else tuple(train_tasks)
-        self.test_tasks = test if test_tasks is None else tuple(test_tasks)
+        self.name = name if config.train_tasks is config.test_tasks is None else f"{name}-part"
+        self.train_tasks = train if config.train_tasks is None else config.train_tasks
+        self.test_tasks = test if config.test_tasks is None else config.test_tasks
         for field, tasks in (("train_tasks", self.train_tasks), ("test_tasks", self.test_tasks)):
             for task in tasks:
                 sub_tasks_of(task, f"suite.{field}")
-        self.horizon = horizon
-        self.start_noise = start_noise
-        self.protocol = f"each sub-task at any step within {horizon}; start noise {start_noise:g}"
+        self.best_score = max(len(sub_tasks_of(task)) for task in (*self.train_tasks, *self.test_tasks))
+        self.horizon = config.horizon or HORIZON
+        self.expert_tasks = (*NAMES, *dict.fromkeys(task for _, tested in SPLITS.values() for task in tested))
+        self.start_noise = config.start_noise
+        self.protocol = f"each sub-task at any step within {self.horizon}; start noise {self.start_noise:g}"
 
     def make_env(self, task: str) -> Environment:
         """Build the environment of a chain, such as ``microwave-kettle-topburner-light``."""
@@ -166,6 +170,28 @@ class KitchenSuite:
     def expert(self, task: str) -> Expert:
         """Return the scripted expert of a chain."""
         return KitchenExpert(sub_tasks_of(task))
+
+    def replay(self, demonstration: Demonstration) -> str:
+        """Return the sub-tasks that a demonstration's actions complete, see `replay`."""
+        return ", ".join(replay(demonstration)) or "none"
+
+    def state_of(self, recorded: Float32[np.ndarray, "steps dims"]) -> Float32[np.ndarray, "steps 30"]:
+        """Return the states in recorded observations.
+
+        Those are: the 30-dimensional states; D4RL's, where goals follow them; or gymnasium-robotics', flattened, where
+        the 59 numbers of ``observation`` follow what is achieved and desired.
+
+        Raises:
+            DemonstrationError: for observations of any other kind.
+        """
+        dims = recorded.shape[1]
+        if dims in (30, 60):
+            return recorded[:, :30]
+        if dims >= 59:
+            return state(recorded[:, -59:])
+        raise DemonstrationError(
+            f"observations: got {dims} numbers; wanted the 30 of a state, D4RL's 60, or 59 and more of FrankaKitchen-v1"
+        )
 
 
 def sub_tasks_of(task: str, field: str = "task") -> tuple[str, ...]:

@@ -17,6 +17,8 @@ from services.suites.push_around_wall import PushAroundWallEnv, PushAroundWallEx
 
 __all__ = ["SPLITS", "TASKS", "MetaWorldSuite", "UnknownSuiteError", "UnknownTaskError"]
 
+HORIZONS = {"paper": 300, "benchmark": 500}
+"""Steps in an episode, by protocol."""
 GOAL_DIM = 3
 """The last numbers of an observation are the goal's position, in metres."""
 
@@ -106,8 +108,10 @@ class MetaWorldSuite:
     after 500 steps.
     """
 
+    family = "metaworld"
     obs_dim = 39
     action_dim = 4
+    best_score = 1
 
     def __init__(self, config: SuiteConfig) -> None:
         """Check the names of suite and tasks.
@@ -120,7 +124,10 @@ class MetaWorldSuite:
         if name is None:
             known = ", ".join(name for name in SPLITS if not name.startswith("ML1-"))
             tasks = ", ".join(task for task in TASKS if f"ML1-{task}" in SPLITS)
-            raise UnknownSuiteError(f"suite.name: got {config.name}; wanted {known}, or ML1- and one of {tasks}")
+            raise UnknownSuiteError(
+                f"suite.name: got {config.name}; wanted {known}, kitchen-topburner, -microwave, -kettle or -slide, or "
+                f"ML1- and one of {tasks}"
+            )
         train, test = SPLITS[name]
         self.name = name if config.train_tasks is config.test_tasks is None else f"{name}-part"
         self.train_tasks = train if config.train_tasks is None else config.train_tasks
@@ -128,7 +135,7 @@ class MetaWorldSuite:
         for field, tasks in (("train_tasks", self.train_tasks), ("test_tasks", self.test_tasks)):
             if unknown := [task for task in tasks if task not in TASKS]:
                 raise UnknownTaskError(f"suite.{field}: got {', '.join(unknown)}; wanted some of {', '.join(TASKS)}")
-        self.horizon = config.steps
+        self.horizon = config.horizon or HORIZONS[config.protocol]
         self._goal_visible = config.goal_visible
         rule = f"goal {'visible' if config.goal_visible else 'hidden'}; success at any step within {self.horizon}"
         self.protocol = rule if config.protocol == "paper" else f"Meta-World's evaluation; {rule}"

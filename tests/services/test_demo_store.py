@@ -18,6 +18,8 @@ from services.demo_store import DemoStore, TaskDemonstrations
 from services.digests import write_listing
 from services.experiment import Experiment, open_runner
 from services.suites.base import Attempt
+from services.suites.metaworld import MetaWorldSuite
+from services.suites.registry import open_suite
 
 ID = "reach/scripted-test-v0"
 
@@ -238,26 +240,28 @@ def test_whoever_is_slower_takes_what_the_faster_one_wrote(attempts: list[Attemp
 
 
 def test_other_settings_other_id():
-    def name(task: str = "reach", horizon: int = 300, **settings: float) -> str:
-        return DemoStore.dataset_id(
-            task, SuiteConfig(horizon=horizon), DemonstrationConfig.model_validate({"per_task": 50} | settings)
-        )
+    def name(task: str = "reach", suite: dict[str, object] | None = None, **settings: object) -> str:
+        given = MetaWorldSuite(SuiteConfig.model_validate(suite or {}))
+        return DemoStore.dataset_id(task, given, DemonstrationConfig.model_validate({"per_task": 50} | settings))
 
     others = [
-        name("push"), name(horizon=200), name(per_task=60), name(noise=0.2), name(trailing_steps=3), name(seed=1)
+        name("push"), name(suite={"horizon": 200}), name(suite={"goal_visible": False}), name(per_task=60),
+        name(noise=0.2), name(trailing_steps=3), name(seed=1), name(labels="noisy"), name(longest="reference"),
     ]  # fmt: skip
-    assert len({name(), *others}) == 7
-    assert name() == name(held_out=10), "which are held out does not change what is collected"
+    assert len({name(), *others}) == 10
+    same = [name(held_out=10), name(source="npz:x.npz"), name(suite={"name": "ml45"}), name(suite={"horizon": 300})]
+    assert {name(), *same, name(suite={"test_tasks": ("push-around-wall",)})} == {name()}
+    assert name().startswith("metaworld/reach/scripted-")
+    kitchens = (open_suite(SuiteConfig(name="kitchen", start_noise=noise)) for noise in (0.5, 1))
+    ids = {DemoStore.dataset_id("microwave", kitchen, DemonstrationConfig()) for kitchen in kitchens}
+    assert len(ids) == 2
 
 
-def test_what_a_policy_may_see_is_part_of_the_id_and_the_rest_of_the_suite_is_not():
-    def name(**settings: object) -> str:
-        return DemoStore.dataset_id("reach", SuiteConfig.model_validate(settings), DemonstrationConfig())
-
-    assert name() == "reach/scripted-5a967c1797-v2", "data sets that are there would be collected again"
-    assert name() == name(name="ml45") == name(horizon=300) == name(test_tasks=("push-around-wall",))
-    assert name(protocol="benchmark") == name(horizon=500) != name()
-    assert name(goal_visible=False) != name()
+def test_an_attempt_is_given_up_at_the_limit():
+    given = DemonstrationConfig(longest="reference")
+    assert [given.steps(task, 300) for task in ("reach", "peg-unplug-side", "bin-picking")] == [100, 140, 160]
+    assert (given.steps("bin-picking", 120), DemonstrationConfig().steps("reach", 300)) == (120, 300)
+    assert DemonstrationConfig(longest=40).steps("reach", 300) == 40
 
 
 def digests(experiment: Experiment, kind, workers: int | None) -> dict[str, tuple[str, int]]:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from dmil_core.configs import EvaluationConfig, SuiteConfig
+from dmil_core.configs import DemonstrationConfig, EvaluationConfig, SuiteConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import Decision, SubSkillUse
 from services.rollouts import demonstrate, rollout, trials
@@ -50,7 +50,7 @@ def make_envs(suite: MetaWorldSuite) -> Callable[[str, int], list[Environment]]:
 @pytest.mark.parametrize("task", ["reach", "door-close"])
 def test_a_demonstration_holds_clean_clipped_actions_and_ends_soon_after_success(suite, make_envs, task: str):
     (env,) = make_envs(task, 1)
-    attempt = demonstrate(suite.expert(task), env, seed=5, horizon=300, noise=0.1, trailing_steps=7)
+    attempt = demonstrate(suite.expert(task), env, 5, 300, DemonstrationConfig(trailing_steps=7))
     assert attempt.solved_at is not None
     assert len(attempt.actions) == attempt.solved_at + 1 + 7
     assert attempt.observations.shape == (len(attempt.actions) + 1, 39)
@@ -65,7 +65,7 @@ def test_a_demonstration_holds_clean_clipped_actions_and_ends_soon_after_success
 def test_a_demonstration_holds_what_a_policy_sees(suite, make_envs, task: str):
     """Some experts change the observation that they are handed."""
     (env,) = make_envs(task, 1)
-    attempt = demonstrate(suite.expert(task), env, seed=5, horizon=40, noise=0, trailing_steps=0)
+    attempt = demonstrate(suite.expert(task), env, 5, 40, DemonstrationConfig(noise=0, trailing_steps=0))
     observation, _ = env.reset(seed=5)
     seen = [observation, *(env.step(action)[0] for action in attempt.actions)]
     assert np.array_equal(attempt.observations, np.asarray(seen, np.float32))
@@ -74,7 +74,8 @@ def test_a_demonstration_holds_what_a_policy_sees(suite, make_envs, task: str):
 @pytest.mark.parametrize("trailing_steps", [0, 10])
 def test_a_demonstration_replayed_without_noise_is_solved_at_the_same_step(suite, make_envs, trailing_steps: int):
     (env,) = make_envs("reach", 1)
-    attempt = demonstrate(suite.expert("reach"), env, 5, 300, noise=0.0, trailing_steps=trailing_steps)
+    config = DemonstrationConfig(noise=0, trailing_steps=trailing_steps)
+    attempt = demonstrate(suite.expert("reach"), env, 5, 300, config)
     env.reset(seed=5)
     solved = [env.step(action)[-1]["success"] for action in attempt.actions]
     assert solved.index(1.0) == attempt.solved_at
@@ -82,7 +83,9 @@ def test_a_demonstration_replayed_without_noise_is_solved_at_the_same_step(suite
 
 def test_noise_changes_what_is_executed_and_follows_from_the_seed(suite, make_envs):
     (env,) = make_envs("push", 1)
-    clean, noisy, again = (demonstrate(suite.expert("push"), env, 5, 300, noise, 10) for noise in (0, 0.1, 0.1))
+    clean, noisy, again = (
+        demonstrate(suite.expert("push"), env, 5, 300, DemonstrationConfig(noise=noise)) for noise in (0, 0.1, 0.1)
+    )
     assert np.array_equal(clean.observations[0], noisy.observations[0])
     assert not np.array_equal(clean.observations[1], noisy.observations[1])
     assert np.array_equal(clean.actions[0], noisy.actions[0])
@@ -90,9 +93,20 @@ def test_noise_changes_what_is_executed_and_follows_from_the_seed(suite, make_en
     assert np.array_equal(noisy.actions, again.actions)
 
 
+def test_noisy_labels_are_what_was_executed(suite, make_envs):
+    (env,) = make_envs("push", 1)
+    attempt = demonstrate(suite.expert("push"), env, 5, 300, DemonstrationConfig(labels="noisy"))
+    clean = demonstrate(suite.expert("push"), env, 5, 300, DemonstrationConfig())
+    assert np.array_equal(attempt.observations, clean.observations)
+    assert 0.01 < np.abs(attempt.actions - clean.actions).mean() < 0.2
+    observation, _ = env.reset(seed=5)
+    seen = [observation, *(env.step(action)[0] for action in attempt.actions)]
+    assert np.array_equal(attempt.observations, np.asarray(seen, np.float32))
+
+
 def test_a_demonstration_never_passes_the_horizon(suite, make_envs):
     (env,) = make_envs("pick-place", 1)
-    attempt = demonstrate(suite.expert("pick-place"), env, 5, horizon=9, noise=0, trailing_steps=10)
+    attempt = demonstrate(suite.expert("pick-place"), env, 5, 9, DemonstrationConfig(noise=0))
     assert attempt.solved_at is None
     assert (len(attempt.actions), len(attempt.observations)) == (9, 10)
 

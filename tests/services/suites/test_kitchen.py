@@ -6,7 +6,8 @@ import mujoco as compiled_mujoco
 import numpy as np
 import pytest
 
-from dmil_core.demonstrations import Demonstration
+from dmil_core.configs import DemonstrationConfig, SuiteConfig
+from dmil_core.demonstrations import Demonstration, DemonstrationError
 from services.rollouts import demonstrate
 from services.suites.inverse_kinematics import Arm, Pose, bounded_least_squares, pose_error
 from services.suites.kitchen import NAMES, SPLITS, KitchenSuite, KitchenTask, UnknownKitchenTaskError, chains, replay
@@ -15,7 +16,7 @@ from services.verification import verify
 
 mujoco: Any = compiled_mujoco  # compiled, so a type checker sees nothing of it
 
-SUITE = KitchenSuite()
+SUITE = KitchenSuite(SuiteConfig(name="kitchen"))
 PAPER = ("microwave-kettle-topburner-light", "microwave-bottomburner-light-slide", "microwave-kettle-hinge-slide")
 
 
@@ -78,7 +79,7 @@ def test_the_splits_hold_a_sub_task_out():
         assert len(set(train)) == len(train) == 15
         assert all(held_out not in task.split("-") and len(task.split("-")) == 4 for task in train)
         assert all(held_out in task.split("-") for task in test)
-        assert KitchenSuite(name).name == name
+        assert KitchenSuite(SuiteConfig(name=name)).name == name
     assert set(PAPER) == {task for _, test in SPLITS.values() for task in test}
     assert set(PAPER) <= set(chains(without=""))
     assert set(NAMES) == set(SUB_TASKS)
@@ -89,12 +90,32 @@ def test_an_unknown_chain_is_named(task):
     with pytest.raises(UnknownKitchenTaskError, match="wanted some of microwave"):
         SUITE.expert(task)
     with pytest.raises(UnknownKitchenTaskError, match=r"suite\.test_tasks"):
-        KitchenSuite(test_tasks=[task])
+        KitchenSuite(SuiteConfig(name="kitchen", test_tasks=(task,)))
 
 
 def test_an_unknown_split_is_named():
-    with pytest.raises(UnknownKitchenTaskError, match="got ml10; wanted one of kitchen-topburner"):
-        KitchenSuite("ml10")
+    with pytest.raises(UnknownKitchenTaskError, match="got ml10; wanted kitchen or kitchen-topburner"):
+        KitchenSuite(SuiteConfig())
+
+
+def test_settings_of_meta_worlds_are_refused():
+    for settings, said in (({"protocol": "benchmark"}, "protocol: got benchmark"), ({"goal_visible": False}, "goal_")):
+        with pytest.raises(UnknownKitchenTaskError, match=said):
+            KitchenSuite(SuiteConfig.model_validate({"name": "kitchen"} | settings))
+
+
+def test_the_state_is_found_in_what_others_record():
+    recorded = np.arange(2 * 93, dtype=np.float32).reshape(2, 93)
+    own = recorded[:, -59:]
+    for observations, wanted in (
+        (recorded[:, :30], recorded[:, :30]),
+        (recorded[:, :60], recorded[:, :30]),
+        (own, np.concatenate((own[:, :9], own[:, 18:39]), axis=1)),
+        (recorded, np.concatenate((own[:, :9], own[:, 18:39]), axis=1)),
+    ):
+        assert np.array_equal(SUITE.state_of(observations), wanted)
+    with pytest.raises(DemonstrationError, match="got 45 numbers; wanted the 30"):
+        SUITE.state_of(recorded[:, :45])
 
 
 def test_the_expert_remembers_nothing():
@@ -125,7 +146,9 @@ def test_the_expert_does_the_papers_chains(task):
 @pytest.mark.slow
 def test_a_replayed_demonstration_does_what_it_did():
     env = SUITE.make_env("microwave")
-    attempt = demonstrate(SUITE.expert("microwave"), env, 3, SUITE.horizon, 0.0, 0)
+    attempt = demonstrate(
+        SUITE.expert("microwave"), env, 3, SUITE.horizon, DemonstrationConfig(noise=0, trailing_steps=0)
+    )
     made_up = Demonstration("000", "microwave", attempt.observations[:-1], attempt.actions)
     assert replay(made_up) == ("microwave",)
     still = Demonstration("001", "microwave", made_up.observations[:20], np.zeros((20, 9), np.float32))

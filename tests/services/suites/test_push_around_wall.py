@@ -8,7 +8,7 @@ import pytest
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from metaworld.policies import SawyerPickPlaceWallV3Policy, SawyerPushV3Policy
 
-from dmil_core.configs import SuiteConfig
+from dmil_core.configs import DemonstrationConfig, SuiteConfig
 from services.rollouts import demonstrate
 from services.suites.base import Environment, Expert
 from services.suites.metaworld import MetaWorldSuite, SeededEpisodes
@@ -57,7 +57,8 @@ def distance(observation: np.ndarray) -> float:
 
 
 def solved(env: Environment, seeds: range, noise: float) -> int:
-    attempts = [demonstrate(PushAroundWallExpert(), env, seed, HORIZON, noise, 10) for seed in seeds]
+    config = DemonstrationConfig(noise=noise)
+    attempts = [demonstrate(PushAroundWallExpert(), env, seed, HORIZON, config) for seed in seeds]
     return sum(attempt.solved_at is not None for attempt in attempts)
 
 

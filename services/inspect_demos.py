@@ -1,0 +1,114 @@
+"""Show a data set's episodes, and what is wrong with them: a Minari data set, an HDF5 file as D4RL's, an npz file."""
+
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from rich.table import Table
+
+from dmil_core.configs import SuiteConfig
+from dmil_core.demonstrations import Demonstration, DemonstrationError
+from services.command_line import exit_code, parse
+from services.progress import Bar, console
+from services.recordings import FORMS, Recording, read_recordings
+from services.suites.base import TaskSuite
+from services.suites.registry import open_suite
+
+__all__ = ["Arguments", "run"]
+
+SUFFIXES = {".npz": "npz", ".hdf5": "hdf5", ".h5": "hdf5"}
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Arguments of ``collect_demos inspect``."""
+
+    data: Annotated[str, tyro.conf.Positional]
+    """An id of Minari's, an HDF5 file or an npz file; see docs/data.md."""
+    suite: str | None = None
+    """Also check that it fits this suite; in the kitchen, replay each episode and show the sub-tasks that it does."""
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run the program."""
+    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
+    suite = None if given.suite is None else open_suite(SuiteConfig(name=given.suite))
+    form = given.data.partition(":")[0]
+    place = given.data if form in FORMS else f"{SUFFIXES.get(Path(given.data).suffix, 'minari')}:{given.data}"
+    recordings = read_recordings(place)
+    console.print(_table(place, recordings, suite))
+    problems = [*_problems(recordings, suite)]
+    for problem in problems:
+        console.print(problem, markup=False)
+    console.print(f"{len(problems)} things are wrong" if problems else "nothing is wrong with it")
+
+
+def _table(place: str, recordings: Sequence[Recording], suite: TaskSuite | None) -> Table:
+    shapes = {(one.observations.shape[1], one.actions.shape[1]) for one in recordings}
+    numbers = " and ".join(f"{obs_dim} observed, {action_dim} done" for obs_dim, action_dim in sorted(shapes))
+    view = Table(title=f"{place}: {len(recordings)} episodes; numbers a step: {numbers}")
+    replay = getattr(suite, "replay", None)
+    columns = ["episode", "steps", "observations", "actions", "reward", "success"]
+    for column in columns + ["replayed"] * (replay is not None):
+        view.add_column(column, justify="left" if column == "replayed" else "right")
+    with Bar("reading", len(recordings)) as bar:
+        for index, one in enumerate(recordings):
+            row = [
+                str(index),
+                str(len(one.actions)),
+                _range(one.observations),
+                _range(one.actions),
+                "" if one.reward is None else f"{one.reward:g}",
+                "" if one.success is None else ("yes" if one.success else "no"),
+            ]
+            view.add_row(*row, *([] if replay is None or suite is None else [_replayed(one, suite)]))
+            bar.advance(1)
+    return view
+
+
+def _range(values: np.ndarray) -> str:
+    return f"{values.min():.3g} to {values.max():.3g}" if values.size else "none"
+
+
+def _replayed(recording: Recording, suite: TaskSuite) -> str:
+    try:
+        return suite.replay(_demonstration(recording, 0, suite))  # type: ignore[attr-defined]
+    except DemonstrationError:
+        return "not possible"
+
+
+def _demonstration(recording: Recording, index: int, suite: TaskSuite | None) -> Demonstration:
+    state_of = getattr(suite, "state_of", lambda observations: observations)
+    return Demonstration(f"{index:03d}", "recorded", state_of(recording.observations), recording.actions)
+
+
+def _problems(recordings: Sequence[Recording], suite: TaskSuite | None) -> Iterator[str]:
+    """Yield what keeps a data set from being learned from, and what looks like a mistake."""
+    seen: dict[bytes, int] = {}
+    for index, one in enumerate(recordings):
+        try:
+            demonstration = _demonstration(one, index, suite)
+        except DemonstrationError as error:
+            yield f"episode {index}: {error}"
+            continue
+        if suite is not None:
+            for field, wanted in (("observations", suite.obs_dim), ("actions", suite.action_dim)):
+                if (got := getattr(demonstration, field).shape[1]) != wanted:
+                    yield f"episode {index}: {field}: got {got} numbers a step; {suite.name} wants {wanted}"
+        if (far := np.abs(one.actions).max()) > 1:
+            yield f"episode {index}: actions of up to {far:.3g}; wanted -1 to 1: acting clips what lies outside"
+        if len(one.actions) > 1 and not one.actions.std(axis=0).any():
+            yield f"episode {index}: the same action at every step"
+        if one.success is False:
+            yield f"episode {index}: no step is a success"
+        before = seen.setdefault(one.observations.tobytes() + one.actions.tobytes(), index)
+        if before != index:
+            yield f"episode {index}: the same as episode {before}"
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(run, sys.argv[1:]))

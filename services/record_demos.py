@@ -1,0 +1,68 @@
+"""Store rollouts of any policy, or of a person, as the demonstrations of a task."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from dmil_core.configs import SuiteConfig
+from dmil_core.demonstrations import Demonstration
+from services.command_line import ConfigError, exit_code, parse
+from services.demo_store import DemoStore, data_root
+from services.progress import console
+from services.recordings import FORMS, demonstrations
+from services.suites.base import Attempt
+from services.suites.registry import open_suite
+
+__all__ = ["Arguments", "run"]
+
+MOST = 10_000
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Arguments of ``collect_demos record``."""
+
+    suite: str
+    """The suite that has the task."""
+    task: str
+    """The task that the rollouts do."""
+    source: Annotated[str, tyro.conf.arg(name="from")]
+    """The rollouts: npz:PATH, hdf5:PATH or minari:ID; see docs/data.md."""
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run the program."""
+    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, tyro.MISSING, tyro.MISSING))
+    if given.source.partition(":")[0] not in FORMS:
+        raise ConfigError(f"--from: got {given.source}; wanted npz:PATH, hdf5:PATH or minari:ID")
+    suite = open_suite(SuiteConfig(name=given.suite, train_tasks=(given.task,), test_tasks=(given.task,)))
+    recorded = demonstrations(given.task, given.source, suite, MOST)
+    store = DemoStore(data_root())
+    dataset_id = f"{suite.family}/{given.task}/recorded-{recorded.digest[:10]}-v2"
+    saved = store.save(
+        dataset_id,
+        given.task,
+        [_attempt(demonstration) for demonstration in recorded.demonstrations],
+        failed=0,
+        settings={"protocol": suite.protocol, "source": given.source},
+        algorithm="recorded",
+    )
+    steps = sum(len(demonstration) for demonstration in saved.demonstrations)
+    console.print(
+        f"{store.root / dataset_id}: {len(saved.demonstrations)} demonstrations of {steps} steps\n"
+        f"to use them: --suite {given.suite} --demos minari:{given.task}={dataset_id}"
+    )
+
+
+def _attempt(demonstration: Demonstration) -> Attempt:
+    """Return what the store takes; the observation after the last action, which no one needs, is the one before it."""
+    observations = np.concatenate((demonstration.observations, demonstration.observations[-1:]))
+    return Attempt(0, [], None, observations, demonstration.actions)
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(run, sys.argv[1:]))

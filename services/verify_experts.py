@@ -1,0 +1,86 @@
+"""Show how often each scripted expert of a suite does its task, by the seeds of its episodes."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rich.table import Table
+
+from dmil_core.configs import SuiteConfig
+from dmil_core.statistics import success_rate
+from services.command_line import exit_code, parse
+from services.experiment import RunnerKind, open_runner
+from services.progress import Bar, console
+from services.suites.base import TaskSuite
+from services.suites.registry import open_suite
+from services.verification import VerificationRow
+
+__all__ = ["Arguments", "run"]
+
+CHUNK = 5
+"""Seeds in one call to a simulation worker."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Arguments of ``collect_demos verify``."""
+
+    suite: str = "ml10"
+    """Whose experts: the name of a suite, as ml45, push-around-wall or kitchen."""
+    tasks: tuple[str, ...] | None = None
+    """Only these tasks."""
+    seeds: int = 20
+    """Episodes of each task."""
+    first_seed: int = 0
+    """The seeds count up from it."""
+    noise: float = 0.1
+    """Standard deviation of the noise added to the executed actions."""
+    runner: RunnerKind = "ray"
+    """Where to work: in Ray actors, or in this process."""
+    workers: int | None = None
+    """Ray workers, one for each CPU of the cluster if not given."""
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run the program."""
+    given = parse(Arguments, __doc__ or "", arguments, Arguments())
+    config = SuiteConfig.model_validate({"name": given.suite, "train_tasks": given.tasks, "test_tasks": given.tasks})
+    suite = open_suite(config)
+    tasks = given.tasks or getattr(suite, "expert_tasks", (*suite.train_tasks, *suite.test_tasks))
+    tasks = [task for task in dict.fromkeys(tasks) if suite.expert(task) is not None]
+    seeds = range(given.first_seed, given.first_seed + given.seeds)
+    calls = [(task, seeds[at : at + CHUNK], given.noise) for task in tasks for at in range(0, len(seeds), CHUNK)]
+    rows: list[VerificationRow] = []
+    with open_runner(given.runner, suite, given.workers) as runner, Bar("verifying", len(tasks) * len(seeds)) as bar:
+        for _, made in runner.simulate("verify", calls):
+            rows += made
+            bar.advance(len(made), made[0].task)
+    console.print(_table(suite, tasks, rows, given))
+
+
+def _table(suite: TaskSuite, tasks: Sequence[str], rows: Sequence[VerificationRow], given: Arguments) -> Table:
+    seeds = f"seeds {given.first_seed} to {given.first_seed + given.seeds - 1}"
+    view = Table(title=f"Experts ({suite.protocol}; noise {given.noise:g}; {seeds})")
+    scored = suite.best_score > 1
+    for column in ("task", "successes", "success rate", "95% interval", *(["score"] * scored), "steps", "longest"):
+        view.add_column(column, justify="left" if column == "task" else "right")
+    for task in [*tasks, None]:
+        of_task = [row for row in rows if task in (row.task, None)]
+        rate = success_rate([row.success for row in of_task])
+        steps = [row.steps for row in of_task if row.success] or [0]
+        view.add_row(
+            task or "all",
+            f"{rate.successes}/{rate.episodes}",
+            f"{rate.rate:.3f}",
+            f"{rate.low:.3f} to {rate.high:.3f}",
+            *([f"{np.mean([row.score for row in of_task]):.2f}"] * scored),
+            f"{np.mean(steps):.0f}",
+            str(max(steps)),
+            end_section=task == tasks[-1],
+        )
+    return view
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(run, sys.argv[1:]))
