@@ -7,6 +7,7 @@ from itertools import combinations
 from typing import Any
 
 import gymnasium
+import mujoco as compiled_mujoco
 import numpy as np
 from gymnasium.spaces import Box
 from jaxtyping import Float32, Float64
@@ -15,10 +16,12 @@ from dmil_core.configs import SuiteConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.errors import UserError
 from services.suites.base import Environment, Expert
-from services.suites.kitchen_expert import KitchenExpert
+from services.suites.kitchen_expert import KitchenExpert, kitchen_model
 
 with contextlib.redirect_stderr(io.StringIO()):  # it prints a notice about environments that are not the kitchen
-    from gymnasium_robotics.envs.franka_kitchen.kitchen_env import KitchenEnv
+    from gymnasium_robotics.envs.franka_kitchen import kitchen_env
+
+mujoco: Any = compiled_mujoco  # compiled, so a type checker sees nothing of it
 
 __all__ = ["NAMES", "SPLITS", "KitchenSuite", "KitchenTask", "UnknownKitchenTaskError", "chains", "replay"]
 
@@ -68,6 +71,16 @@ START_KETTLE = 0.01
 """Metres by which the kettle's first place may differ, in either direction of the stove."""
 
 
+class SharedModelRobot(kitchen_env.FrankaRobot):
+    """Takes the model that is read once in a process: that takes 0.6 s, and nobody changes it."""
+
+    def _initialize_simulation(self) -> tuple[Any, Any]:
+        return kitchen_model(), mujoco.MjData(kitchen_model())
+
+
+kitchen_env.FrankaRobot = SharedModelRobot  # its environment has no other way to be given one
+
+
 class KitchenTask(gymnasium.Env[np.ndarray, np.ndarray]):
     """One chain of sub-tasks, from starts drawn at random.
 
@@ -87,7 +100,7 @@ class KitchenTask(gymnasium.Env[np.ndarray, np.ndarray]):
             chain: sub-tasks, keys of `NAMES`.
             start_noise: how far starts differ, in units of `START_ANGLE` and `START_KETTLE`.
         """
-        self._env = KitchenEnv([NAMES[sub_task] for sub_task in chain])
+        self._env = kitchen_env.KitchenEnv([NAMES[sub_task] for sub_task in chain])
         self._rest = self._env.robot_env.init_qpos
         spread = [START_ANGLE] * 7 + [START_KETTLE] * 2
         self._spread = start_noise * np.array(spread)
