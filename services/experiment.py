@@ -113,10 +113,14 @@ class Experiment:
         Args:
             config: all settings.
             store: where its demonstrations are, or will be.
+
+        Raises:
+            UserError: for a suite, a task or a source of demonstrations that there is not.
         """
         self.config = config
         self.suite: TaskSuite = open_suite(config.suite)
         self.store = store
+        self._places = self._find_places()
 
     @property
     def tasks(self) -> list[tuple[Split, str]]:
@@ -140,7 +144,7 @@ class Experiment:
         """
         names = list(dict.fromkeys(task for _, task in self.tasks))
         settings = self.config.demonstrations
-        found = self._recorded(names)
+        found = self._recorded()
         ids = {task: self.store.dataset_id(task, self.suite, settings) for task in names if task not in found}
         missing = []
         for task, dataset_id in ids.items():
@@ -166,18 +170,22 @@ class Experiment:
                 )
         return {task: found[task] for task in names}
 
-    def _recorded(self, names: Sequence[str]) -> dict[str, TaskDemonstrations]:
-        """Return the demonstrations of those tasks that the settings name a data set for."""
-        settings, evaluation = self.config.demonstrations, self.config.evaluation
-        if settings.source == "expert":
+    def _find_places(self) -> dict[str, str]:
+        """Return where the demonstrations of those tasks are that the settings name a data set for."""
+        if self.config.demonstrations.source == "expert":
             return {}
-        places = places_of(settings.source)
+        places, names = places_of(self.config.demonstrations.source), dict.fromkeys(task for _, task in self.tasks)
         if unknown := [task for task in places if task not in names]:
             raise DemonstrationError(
                 f"demonstrations.source: got data sets of {', '.join(unknown)}; {self.suite.name} has the tasks "
                 f"{', '.join(names)}; name the task that a data set is of: TASK=ID"
             )
-        found = {task: demonstrations(task, place, self.suite, settings.per_task) for task, place in places.items()}
+        return places
+
+    def _recorded(self) -> dict[str, TaskDemonstrations]:
+        """Read the data sets that the settings name."""
+        settings, evaluation = self.config.demonstrations, self.config.evaluation
+        found = {task: demonstrations(task, at, self.suite, settings.per_task) for task, at in self._places.items()}
         support = max(evaluation.shots) * evaluation.support_draws
         for task, dataset in found.items():
             wanted = settings.held_out + 1 if task in self.suite.train_tasks else support
