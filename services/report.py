@@ -1,6 +1,11 @@
-"""What a run shows at its end: the table on the terminal, and its report folder with tables and plots."""
+"""What a run shows at its end: the table on the terminal, and its report folder with tables and plots.
 
-from collections.abc import Mapping
+As a program it draws what there is to look at: ``python -m services.report gallery``.
+"""
+
+import sys
+from collections.abc import Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 
 import matplotlib
@@ -10,12 +15,13 @@ from matplotlib import pyplot
 from matplotlib.axes import Axes
 
 from services.checkpoints import Checkpoint
+from services.command_line import ConfigError, exit_code
 from services.progress import console
 from services.summary import AGAINST_COLLAPSE, COLLAPSED, Summary, rates, table, table_markdown, write_summary
 from services.tracking import Tracker, redacted
 from services.tracking.spool import Measured, read_spool
 
-__all__ = ["draw_curves", "publish", "read_metrics", "show", "write_report"]
+__all__ = ["draw_curves", "publish", "read_metrics", "run", "show", "write_report"]
 
 PANELS: Mapping[str, tuple[str, ...]] = {
     "high-level loss": ("high_loss_before", "high_loss_after"),
@@ -25,6 +31,8 @@ PANELS: Mapping[str, tuple[str, ...]] = {
     "agreement and usage entropy": ("agreement", "sub_skill_entropy"),
     "gradient norm": ("gradient_norm",),
 }
+KINDS = {"gallery": "services.gallery"}
+"""What the program draws, and the module that does."""
 SMOOTHED = 50
 """A curve is drawn through so many means at most."""
 
@@ -111,3 +119,19 @@ def show(summary: Summary, tracking_uri: str | None = None) -> None:
         console.print(f"MLflow run: {summary.mlflow_run_id or 'not there yet'} at {redacted(tracking_uri)}")
         if tracking_uri.startswith("sqlite"):
             console.print(f"to look at it: mlflow ui --backend-store-uri {tracking_uri} --host 127.0.0.1")
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run the program that draws what the first argument names.
+
+    Raises:
+        ConfigError: if it names nothing that can be drawn.
+    """
+    if not arguments or arguments[0] not in KINDS:
+        got = arguments[0] if arguments else "nothing"
+        raise ConfigError(f"report: got {got}; wanted one of {', '.join(KINDS)}, each with a --help of its own")
+    import_module(KINDS[arguments[0]]).run(arguments[1:])
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(run, sys.argv[1:]))

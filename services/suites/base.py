@@ -43,6 +43,7 @@ class TaskSuite(Protocol):
     - ``state_of(recorded)``: the observations (steps, `obs_dim`) in recorded ones (steps, any dimensions), for data
       sets that hold more, or another form;
     - ``replay(demonstration)``: what its actions lead to, in words;
+    - ``camera``: what `services.suites.rendering.picture` looks through, if its environments are MuJoCo's;
     - ``expert_tasks``: the tasks whose experts are verified, where those are not the tasks of both splits.
     """
 

@@ -17,6 +17,7 @@ from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.errors import UserError
 from services.suites.base import Environment, Expert
 from services.suites.kitchen_expert import KitchenExpert, kitchen_model
+from services.suites.rendering import View
 
 with contextlib.redirect_stderr(io.StringIO()):  # it prints a notice about environments that are not the kitchen
     from gymnasium_robotics.envs.franka_kitchen import kitchen_env
@@ -101,6 +102,7 @@ class KitchenTask(gymnasium.Env[np.ndarray, np.ndarray]):
             start_noise: how far starts differ, in units of `START_ANGLE` and `START_KETTLE`.
         """
         self._env = kitchen_env.KitchenEnv([NAMES[sub_task] for sub_task in chain])
+        self.model, self.data = self._env.model, self._env.data
         self._rest = self._env.robot_env.init_qpos
         spread = [START_ANGLE] * 7 + [START_KETTLE] * 2
         self._spread = start_noise * np.array(spread)
@@ -147,6 +149,7 @@ class KitchenSuite:
     """Chains in a split; an episode is a success if every sub-task was done at some step within the horizon."""
 
     family = "kitchen"
+    camera = View((-0.2, 0.5, 2.0), distance=2.2, azimuth=70, elevation=-35)
     obs_dim = 30
     action_dim = 9
 

@@ -14,6 +14,7 @@ from dmil_core.errors import UserError
 from services.suites.base import Environment, Expert
 from services.suites.metaworld_speed import fast_environment
 from services.suites.push_around_wall import PushAroundWallEnv, PushAroundWallExpert
+from services.suites.rendering import View
 
 __all__ = ["SPLITS", "TASKS", "MetaWorldSuite", "UnknownSuiteError", "UnknownTaskError"]
 
@@ -109,6 +110,7 @@ class MetaWorldSuite:
     """
 
     family = "metaworld"
+    camera = View((0.0, 0.62, 0.1), distance=1.25, azimuth=145, elevation=-30)
     obs_dim = 39
     action_dim = 4
     best_score = 1

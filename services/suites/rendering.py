@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import mujoco as compiled_mujoco
@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 
 from dmil_core.errors import UserError
 
-__all__ = ["RenderingError", "picture"]
+__all__ = ["RenderingError", "View", "picture"]
 
 mujoco: Any = compiled_mujoco  # compiled, so a type checker sees nothing of it
 
@@ -25,14 +25,27 @@ class RenderingError(UserError):
     """A picture that cannot be drawn."""
 
 
+class View(NamedTuple):
+    """A camera anywhere."""
+
+    lookat: tuple[float, float, float]
+    """The point in the middle of the picture, in metres."""
+    distance: float
+    """From that point, in metres."""
+    azimuth: float
+    """The direction it looks in, in degrees around the vertical."""
+    elevation: float
+    """In degrees above the horizon; below 0 it looks down."""
+
+
 def picture(
-    env: gymnasium.Env[Any, Any], camera: str, height: int = 360, width: int = 480
+    env: gymnasium.Env[Any, Any], camera: str | View, height: int = 360, width: int = 480
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Draw what a camera sees now, in red, green and blue; where it hangs upside down, the picture is turned upright.
 
     Args:
         env: has MuJoCo's ``model`` and ``data`` in it, and stays as it is.
-        camera: one that the model names, in Meta-World for example corner2.
+        camera: one that the model names, in Meta-World for example corner2, or one of one's own.
         height: in pixels.
         width: in pixels.
 
@@ -41,19 +54,27 @@ def picture(
     """
     unwrapped: Any = env.unwrapped
     model, data = unwrapped.model, unwrapped.data
-    cameras = [model.camera(index).name for index in range(model.ncam)]
-    if camera not in cameras:
-        raise RenderingError(f"camera: got {camera}; wanted one of {', '.join(cameras)}")
-    view = mujoco.MjvCamera()
-    view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, cameras.index(camera)
+    view = _camera(model, camera)
     scene, frame = mujoco.MjvScene(model, maxgeom=10_000), mujoco.MjrRect(0, 0, width, height)
     pixels = np.empty((height, width, 3), np.uint8)
     with _drawing(model, height, width) as context:
         mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, view, mujoco.mjtCatBit.mjCAT_ALL, scene)
         mujoco.mjr_render(frame, scene, context)
         mujoco.mjr_readPixels(pixels, None, frame, context)
-    upright = data.cam_xmat[view.fixedcamid].reshape(3, 3)[2, 1] >= 0
+    upright = view.fixedcamid < 0 or data.cam_xmat[view.fixedcamid].reshape(3, 3)[2, 1] >= 0
     return (pixels[::-1] if upright else pixels[:, ::-1]).copy()  # OpenGL's first row is the lowest
+
+
+def _camera(model: Any, camera: str | View) -> Any:
+    view = mujoco.MjvCamera()
+    if isinstance(camera, View):
+        view.lookat[:], view.distance, view.azimuth, view.elevation = camera
+        return view
+    cameras = [model.camera(index).name for index in range(model.ncam)]
+    if camera not in cameras:
+        raise RenderingError(f"camera: got {camera}; wanted one of {', '.join(cameras)}")
+    view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, cameras.index(camera)
+    return view
 
 
 @contextmanager

@@ -1,0 +1,109 @@
+"""Draw the tasks of every suite, each as its expert solves it: the paper's Figures 6 to 9."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import numpy as np
+from jaxtyping import UInt8
+from matplotlib import pyplot
+
+from dmil_core.configs import DemonstrationConfig, SuiteConfig
+from services.command_line import ConfigError, exit_code, parse
+from services.disk import room_for
+from services.progress import Bar, console
+from services.rollouts import demonstrate
+from services.suites.base import TaskSuite
+from services.suites.registry import open_suite
+from services.suites.rendering import View, picture
+
+__all__ = ["Arguments", "draw_gallery", "run"]
+
+FIGURES = {"ml10": "Figure 7", "ml45": "Figure 6", "push-around-wall": "Figure 8", "kitchen": "Figure 9"}
+"""The paper's suites, and where it shows them."""
+COLUMNS = {"ml45": 10, "kitchen": 4}
+HEIGHT, WIDTH = 180, 240
+MOMENT = 0.6
+"""Each picture is taken after this part of the steps that the expert takes to solve the task."""
+MOST_BYTES = 2**22
+"""Of a gallery's file."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Arguments of ``report gallery``."""
+
+    suites: tuple[str, ...] = tuple(FIGURES)
+    """Which suites."""
+    output: Path = Path("gallery")
+    """Folder for a picture of each suite, SUITE.jpg."""
+    seed: int = 0
+    """Of the episodes."""
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run the program."""
+    given = parse(Arguments, __doc__ or "", arguments, Arguments())
+    given.output.mkdir(parents=True, exist_ok=True)
+    for name in given.suites:
+        suite = open_suite(SuiteConfig(name=name))
+        camera: str | View | None = getattr(suite, "camera", None)
+        if camera is None:
+            raise ConfigError(f"--suites: got {name}, which names no camera; wanted suites whose tasks can be drawn")
+        path = given.output / f"{name}.jpg"
+        draw_gallery(suite, camera, given.seed, path, COLUMNS.get(name, 5))
+        console.print(str(path))
+
+
+def draw_gallery(suite: TaskSuite, camera: str | View, seed: int, path: Path, columns: int) -> None:
+    """Draw all tasks of a suite in a grid; those of meta-testing are marked.
+
+    Raises:
+        RenderingError: if there is nothing here to draw with.
+    """
+    tasks = list(dict.fromkeys((*suite.train_tasks, *suite.test_tasks)))
+    rows = -(-len(tasks) // columns)
+    size = 2 * columns, 1.75 * rows
+    figure, axes = pyplot.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
+    for axis in axes.flat:
+        axis.set_axis_off()
+    with Bar(f"drawing {suite.name}", len(tasks)) as bar:
+        for axis, task in zip(axes.flat, tasks, strict=False):
+            axis.imshow(_at_work(suite, camera, task, seed))
+            tested = task in suite.test_tasks
+            title = _in_lines(task) + "\n(meta-testing)" * tested
+            axis.set_title(title, fontsize=7, fontweight="bold" if tested else "normal")
+            bar.advance(1, task)
+    with room_for(path, MOST_BYTES):
+        figure.savefig(path, dpi=110, pil_kwargs={"quality": 85})
+    pyplot.close(figure)
+
+
+def _in_lines(task: str) -> str:
+    """Return a task's name on two lines if it is a long one."""
+    words = task.split("-")
+    half = (len(words) + 1) // 2
+    return task if len(task) <= 24 else "-".join(words[:half]) + "-\n" + "-".join(words[half:])
+
+
+def _at_work(suite: TaskSuite, camera: str | View, task: str, seed: int) -> UInt8[np.ndarray, "height width 3"]:
+    env, expert = suite.make_env(task), suite.expert(task)
+    if expert is None:
+        env.reset(seed=seed)
+    else:
+        config = DemonstrationConfig(noise=0, trailing_steps=0)
+        attempt = demonstrate(expert, env, seed, suite.horizon, config)
+        env.reset(seed=seed)
+        for action in attempt.actions[: int(MOMENT * len(attempt.actions))]:
+            env.step(action)
+    drawn = picture(env, camera, HEIGHT, WIDTH)
+    env.close()
+    return drawn
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(run, sys.argv[1:]))
