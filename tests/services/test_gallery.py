@@ -1,0 +1,35 @@
+"""The gallery shows each task of a suite."""
+
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from dmil_core.configs import SuiteConfig
+from services import report
+from services.gallery import draw_gallery
+from services.suites.registry import open_suite
+from services.suites.rendering import RenderingError
+
+
+def test_the_gallery_has_a_picture_for_each_task(tmp_path: Path):
+    sizes = []
+    for tasks in (("reach",), ("reach", "drawer-close", "door-open")):
+        suite = open_suite(SuiteConfig(train_tasks=tasks, test_tasks=tasks[-1:]))
+        path = tmp_path / f"{len(tasks)}.jpg"
+        try:
+            draw_gallery(suite, suite.camera, 0, path, columns=2)  # type: ignore[attr-defined]
+        except RenderingError as error:
+            pytest.skip(str(error))
+        with Image.open(path) as drawn:
+            sizes.append(drawn.size)
+            assert len(drawn.getcolors(2**24) or []) > 500, "a robot at a table has many colours"
+    (one, two), (wide, high) = sizes
+    assert wide == one
+    assert high == pytest.approx(2 * two, abs=2)
+
+
+def test_a_report_that_there_is_not_is_told_in_words(complaint):
+    assert "report: got pie; wanted one of gallery" in complaint(report.run, "pie")
+    assert "report: got nothing" in complaint(report.run)
+    assert "suite.name: got atari" in complaint(report.run, "gallery", "--suites", "atari")
