@@ -246,6 +246,8 @@ def preset_of(suite: str, size: str) -> ExperimentConfig:
         changes["suite"] = SuiteConfig(name=suite, train_tasks=train, test_tasks=test)
     if suite.startswith("kitchen"):
         changes["method"] = config.method.model_copy(update={"sub_skills": 4})  # Table 5's middle column
+        if size == "quick":
+            changes["demonstrations"] = DemonstrationConfig(per_task=50, held_out=12)  # a demonstration takes 1 s
     return config.model_copy(update=changes)
 
 
