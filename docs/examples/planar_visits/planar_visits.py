@@ -80,10 +80,10 @@ class PlanarVisits:
         """Take the tasks and the horizon from the settings, where they are given."""
         self.train_tasks = config.train_tasks or TRAIN_TASKS
         self.test_tasks = config.test_tasks or TEST_TASKS
-        for task in (*self.train_tasks, *self.test_tasks):
-            if task not in TRAIN_TASKS + TEST_TASKS:
+        for field, tasks in (("train_tasks", self.train_tasks), ("test_tasks", self.test_tasks)):
+            if unknown := [task for task in tasks if task not in TRAIN_TASKS + TEST_TASKS]:
                 known = ", ".join(TRAIN_TASKS + TEST_TASKS)
-                raise UserError(f"suite.train_tasks or suite.test_tasks: got {task}; wanted some of {known}")
+                raise UserError(f"suite.{field}: got {', '.join(unknown)}; wanted some of {known}")
         whole = (self.train_tasks, self.test_tasks) == (TRAIN_TASKS, TEST_TASKS)
         self.name = "planar-visits" if whole else "planar-visits-part"
         self.horizon = config.horizon or HORIZON

@@ -211,7 +211,7 @@ MISTAKES = {
     "no name": (("--suite", "planar_visits"), ("--suite: got 'planar_visits'; wanted a name of letters",)),
     "no such task": (
         ("--suite.test-tasks", "red-red-red"),
-        ("got red-red-red; wanted some of red-green-blue, red-blue-green",),
+        ("suite.test_tasks: got red-red-red; wanted some of red-green-blue, red-blue-green",),
     ),
     "not heeded": (
         ("--suite.start-noise", "2"),
@@ -339,3 +339,9 @@ def test_verify_says_what_is_wrong_with_an_environment(register, capsys, methods
 @pytest.mark.usefixtures("plug_in")
 def test_what_names_no_suite_or_task_is_told_in_words(complaint, flags: tuple[str, ...], said: str):
     assert said in complaint(collect_demos.run, *flags)
+
+
+def test_the_page_and_the_example_agree():
+    page = (PROJECT / "docs" / "your-own-task.md").read_text("utf-8")
+    for name, language in (("planar_visits.py", "python"), ("pyproject.toml", "toml")):
+        assert f"```{language}\n{(EXAMPLE / name).read_text('utf-8')}```\n" in page
