@@ -67,7 +67,7 @@ def run(arguments: Sequence[str]) -> None:
 def _table(data: dict[str, TaskDemonstrations]) -> Table:
     view = Table(title="Demonstrations")
     for column in ("task", "demonstrations", "failed attempts", "mean steps", "longest", "SHA-256", "Minari id"):
-        view.add_column(column, justify="left" if column in ("task", "Minari id") else "right")
+        view.add_column(column, justify="left" if column in ("task", "Minari id") else "right", overflow="fold")
     for task, dataset in data.items():
         lengths = [len(demonstration) for demonstration in dataset.demonstrations]
         view.add_row(

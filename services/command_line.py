@@ -12,7 +12,7 @@ import tyro
 import yaml
 from pydantic import ValidationError
 
-from dmil_core.configs import PRESETS, SIZES, EvaluationConfig, ExperimentConfig, preset_of
+from dmil_core.configs import PRESETS, SIZES, EvaluationConfig, ExperimentConfig, SuiteConfig, preset_of
 from dmil_core.errors import RunError, UserError, explain, shown
 from services.disk import read_file
 
@@ -24,6 +24,7 @@ __all__ = [
     "main",
     "parse",
     "peek",
+    "suite_settings",
     "with_evaluation",
 ]
 
@@ -78,13 +79,31 @@ def config_from(preset: str, file: Path | None, suite: str | None = None) -> Exp
     try:
         settings = preset_of(suite or named or DEFAULT_SUITE, size).model_dump()
     except ValidationError as error:
-        raise ConfigError(f"--suite: got {shown(suite)}; wanted the name of a suite, as ml10") from error
+        raise _no_name(suite) from error
     if file is not None:
         given = _read_yaml(file)
         if not isinstance(given, dict):
             raise ConfigError(f"--config: got {file} with {type(given).__name__} in it; wanted keys with values")
         _merge(settings, given, str(file), "")
     return _checked(settings, "" if file is None else f"{file}: ")
+
+
+def suite_settings(suite: str, tasks: Sequence[str] | None = None) -> SuiteConfig:
+    """Return the settings of a suite, with `tasks` in place of those of both splits if they are given.
+
+    Raises:
+        ConfigError: for what cannot be the name of a suite, or no task at all.
+    """
+    if tasks is not None and not tasks:
+        raise ConfigError("--tasks: got none; wanted at least one; leave it out for all")
+    try:
+        return SuiteConfig.model_validate({"name": suite, "train_tasks": tasks, "test_tasks": tasks})
+    except ValidationError as error:
+        raise _no_name(suite) from error
+
+
+def _no_name(suite: str | None) -> ConfigError:
+    return ConfigError(f"--suite: got {shown(suite)}; wanted a name of letters, digits and hyphens, as ml10")
 
 
 class _PlainLoader(yaml.SafeLoader):

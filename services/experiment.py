@@ -23,7 +23,7 @@ from services.failures import keeping_failures
 from services.progress import Bar, console
 from services.provenance import library_versions
 from services.ray_runner import RayRunner
-from services.recordings import demonstrations, places_of
+from services.recordings import check_dimensions, demonstrations, places_of
 from services.results import Split
 from services.rollouts import TrialOutcome
 from services.runners import Iteration, LocalRunner, Plan, Runner
@@ -149,7 +149,7 @@ class Experiment:
         missing = []
         for task, dataset_id in ids.items():
             if (dataset := self.store.load(dataset_id, task)) is not None:
-                found[task] = dataset
+                found[task] = self._checked(dataset)
             elif self.suite.expert(task) is None:
                 raise DemonstrationError(
                     f"demonstrations.source: got nothing for {task}, which has no scripted expert; wanted a data set: "
@@ -169,6 +169,16 @@ class Experiment:
                     settings={"protocol": self.suite.protocol, **settings.model_dump()},
                 )
         return {task: found[task] for task in names}
+
+    def _checked(self, dataset: TaskDemonstrations) -> TaskDemonstrations:
+        """Return a stored data set that fits the suite, which may have been changed since."""
+        try:
+            check_dimensions(dataset.demonstrations[0], self.suite)
+        except DemonstrationError as error:
+            raise DemonstrationError(
+                f"{self.store.root / dataset.id}: {error}; remove it, or name in the suite's protocol what has changed"
+            ) from error
+        return dataset
 
     def _find_places(self) -> dict[str, str]:
         """Return where the demonstrations of those tasks are that the settings name a data set for."""

@@ -10,9 +10,8 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from dmil_core.configs import SuiteConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError
-from services.command_line import exit_code, parse
+from services.command_line import exit_code, parse, suite_settings
 from services.progress import Bar, console
 from services.recordings import FORMS, Recording, read_recordings
 from services.suites.base import TaskSuite
@@ -36,7 +35,7 @@ class Arguments:
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
-    suite = None if given.suite is None else open_suite(SuiteConfig(name=given.suite))
+    suite = None if given.suite is None else open_suite(suite_settings(given.suite))
     form = given.data.partition(":")[0]
     place = given.data if form in FORMS else f"{SUFFIXES.get(Path(given.data).suffix, 'minari')}:{given.data}"
     recordings = read_recordings(place)

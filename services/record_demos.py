@@ -8,9 +8,8 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from dmil_core.configs import SuiteConfig
 from dmil_core.demonstrations import Demonstration
-from services.command_line import ConfigError, exit_code, parse
+from services.command_line import ConfigError, exit_code, parse, suite_settings
 from services.demo_store import DemoStore, data_root
 from services.progress import console
 from services.recordings import FORMS, demonstrations
@@ -39,7 +38,7 @@ def run(arguments: Sequence[str]) -> None:
     given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, tyro.MISSING, tyro.MISSING))
     if given.source.partition(":")[0] not in FORMS:
         raise ConfigError(f"--from: got {given.source}; wanted npz:PATH, hdf5:PATH or minari:ID")
-    suite = open_suite(SuiteConfig(name=given.suite, train_tasks=(given.task,), test_tasks=(given.task,)))
+    suite = open_suite(suite_settings(given.suite, (given.task,)))
     recorded = demonstrations(given.task, given.source, suite, MOST)
     store = DemoStore(data_root())
     dataset_id = f"{suite.family}/{given.task}/recorded-{recorded.digest[:10]}-v2"

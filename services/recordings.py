@@ -18,7 +18,7 @@ from services.disk import inside
 from services.npz_demonstrations import read_npz
 from services.suites.base import TaskSuite
 
-__all__ = ["FORMS", "Recording", "demonstrations", "places_of", "read_recordings"]
+__all__ = ["FORMS", "Recording", "check_dimensions", "demonstrations", "places_of", "read_recordings"]
 
 FORMS = ("minari", "hdf5", "npz")
 """What data sets may be: an id of Minari's, a file as D4RL has them, a file of arrays."""
@@ -97,14 +97,19 @@ def demonstrations(task: str, place: str, suite: TaskSuite, most: int) -> TaskDe
         try:
             observations = np.ascontiguousarray(state_of(recording.observations), np.float32)
             demonstration = Demonstration(f"{index:03d}", task, observations, recording.actions)
-            _check_dimensions(demonstration, suite)
+            check_dimensions(demonstration, suite)
         except DemonstrationError as error:
             raise DemonstrationError(f"{place}: episode {index}: {error}") from error
         found.append(demonstration)
     return TaskDemonstrations(place, tuple(found), 0, digest(found))
 
 
-def _check_dimensions(demonstration: Demonstration, suite: TaskSuite) -> None:
+def check_dimensions(demonstration: Demonstration, suite: TaskSuite) -> None:
+    """See whether a demonstration has the suite's dimensions.
+
+    Raises:
+        DemonstrationError: if it has not.
+    """
     for field, wanted in (("observations", suite.obs_dim), ("actions", suite.action_dim)):
         if (got := getattr(demonstration, field).shape[1]) != wanted:
             raise DemonstrationError(f"{field}: got {got} numbers a step; {suite.name} wants {wanted}")

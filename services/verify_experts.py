@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from rich.table import Table
 
-from dmil_core.configs import SuiteConfig
+from dmil_core.errors import RunError, WorkError
 from dmil_core.statistics import success_rate
-from services.command_line import exit_code, parse
+from services.command_line import ConfigError, exit_code, parse, suite_settings
 from services.experiment import RunnerKind, open_runner
 from services.progress import Bar, console
 from services.suites.base import TaskSuite
@@ -45,17 +45,25 @@ class Arguments:
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     given = parse(Arguments, __doc__ or "", arguments, Arguments())
-    config = SuiteConfig.model_validate({"name": given.suite, "train_tasks": given.tasks, "test_tasks": given.tasks})
-    suite = open_suite(config)
+    suite = open_suite(suite_settings(given.suite, given.tasks))
     tasks = given.tasks or getattr(suite, "expert_tasks", (*suite.train_tasks, *suite.test_tasks))
     tasks = [task for task in dict.fromkeys(tasks) if suite.expert(task) is not None]
+    if not tasks:
+        raise ConfigError(f"--tasks: got none that has a scripted expert in {suite.name}; wanted at least one")
+    if given.seeds < 1 or given.first_seed < 0:
+        raise ConfigError(
+            f"--seeds, --first-seed: got {given.seeds} from {given.first_seed} on; wanted at least one, none below 0"
+        )
     seeds = range(given.first_seed, given.first_seed + given.seeds)
     calls = [(task, seeds[at : at + CHUNK], given.noise) for task in tasks for at in range(0, len(seeds), CHUNK)]
     rows: list[VerificationRow] = []
     with open_runner(given.runner, suite, given.workers) as runner, Bar("verifying", len(tasks) * len(seeds)) as bar:
-        for _, made in runner.simulate("verify", calls):
-            rows += made
-            bar.advance(len(made), made[0].task)
+        try:
+            for _, made in runner.simulate("verify", calls):
+                rows += made
+                bar.advance(len(made), made[0].task)
+        except WorkError as error:
+            raise RunError(f"{error}\n{error.trace}") from error
     console.print(_table(suite, tasks, rows, given))
 
 

@@ -14,7 +14,7 @@ from dmil_core.methods.base import Method
 from dmil_core.networks import unflatten
 from dmil_core.seeding import stream_seed
 from services.rollouts import Trial, TrialOutcome, demonstrate, try_out
-from services.suites.base import Attempt, Environment, TaskSuite
+from services.suites.base import Attempt, Environment, TaskSuite, build_env
 from services.verification import VerificationRow, verify
 
 __all__ = ["SimulationWorker", "piece_of_call"]
@@ -39,7 +39,7 @@ class SimulationWorker:
         while self._envs and max(count, len(envs)) + sum(map(len, self._envs.values())) > ENVIRONMENTS_KEPT:
             for env in self._envs.pop(next(iter(self._envs))):
                 env.close()
-        envs += [self._suite.make_env(task) for _ in range(count - len(envs))]
+        envs += [build_env(self._suite, task) for _ in range(count - len(envs))]
         self._envs[task] = envs
         return envs
 

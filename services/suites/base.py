@@ -4,9 +4,12 @@ from typing import NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
+from gymnasium.spaces import Box
 from jaxtyping import Float32, Float64
 
-__all__ = ["Attempt", "Environment", "Expert", "TaskSuite"]
+from dmil_core.errors import UserError
+
+__all__ = ["Attempt", "Environment", "Expert", "SuiteError", "TaskSuite", "build_env"]
 
 Environment = gymnasium.Env[np.ndarray, np.ndarray]
 """A task's environment, with a flat observation and actions in a `Box`. ``reset(seed=n)`` twice gives the same episode
@@ -17,7 +20,11 @@ observations leave out something that the expert needs, the infos of resets and 
 
 
 class Expert(Protocol):
-    """A scripted expert of one task."""
+    """A scripted expert of one task.
+
+    One expert acts in many episodes, one after the other, and is not told where one begins: all it knows of an episode
+    is in the observation.
+    """
 
     def get_action(self, obs: Float64[np.ndarray, " obs_dim"], /) -> Float32[np.ndarray, " action_dim"]:
         """Return what the expert does, before clipping to the action space."""
@@ -70,3 +77,26 @@ class TaskSuite(Protocol):
     def expert(self, task: str) -> Expert | None:
         """Return a task's scripted expert, if there is one."""
         ...
+
+
+class SuiteError(UserError):
+    """A package's suite that cannot be used."""
+
+
+def build_env(suite: TaskSuite, task: str) -> Environment:
+    """Build a task's environment, and check its spaces.
+
+    Raises:
+        SuiteError: if they are not those that the suite names.
+    """
+    env = suite.make_env(task)
+    for field, space, size in (
+        ("observation_space", env.observation_space, suite.obs_dim),
+        ("action_space", env.action_space, suite.action_dim),
+    ):
+        if not isinstance(space, Box) or space.shape != (size,):
+            raise SuiteError(
+                f"{suite.name}: task {task}: {field}: got {space}; wanted a Box of the shape ({size},), as the suite's "
+                f"{'obs_dim' if field == 'observation_space' else 'action_dim'} says; mend either"
+            )
+    return env
