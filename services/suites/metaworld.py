@@ -119,9 +119,13 @@ class MetaWorldSuite:
         """Check the names of suite and tasks.
 
         Raises:
-            UnknownSuiteError: for a suite that there is not.
+            UnknownSuiteError: for a suite that there is not, or a setting that it does not have.
             UnknownTaskError: for a task that there is not.
         """
+        if config.start_noise != 1:
+            raise UnknownSuiteError(
+                f"suite.start_noise: got {config.start_noise:g}; that is the kitchen's; leave it out for {config.name}"
+            )
         name = {name.lower(): name for name in SPLITS}.get(config.name.lower())
         if name is None:
             known = ", ".join(name for name in SPLITS if not name.startswith("ML1-"))

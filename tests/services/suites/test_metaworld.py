@@ -106,6 +106,11 @@ def test_an_unknown_suite_is_named_with_the_known_ones(name):
     assert all(task in message for task in ALL_TASKS)
 
 
+def test_a_setting_of_the_kitchen_s_is_refused():
+    with pytest.raises(UnknownSuiteError, match=r"suite\.start_noise: got 2; that is the kitchen's"):
+        MetaWorldSuite(SuiteConfig(start_noise=2))
+
+
 # Protocols
 
 
