@@ -40,6 +40,13 @@ PROJECT = Path(__file__).parents[2]
 SECONDS_TO_START = 90
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Count what needs the cluster among the slow tests: the quick ones run in several processes."""
+    for item in items:
+        if "cluster" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture(scope="session")
 def config() -> ExperimentConfig:
     """Three tasks to train on and one to test on, tiny networks."""

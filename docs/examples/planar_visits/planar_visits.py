@@ -17,6 +17,9 @@ SPEED = 0.1
 """Metres in a step along each axis, at an action of 1."""
 RADIUS = 0.1
 """A station is visited from so near, in metres."""
+PLACES = np.array([[-0.6, -0.4], [0.6, -0.4], [0.0, 0.7]])
+SPREAD = 0.15
+"""Stations lie so far from these places at most, and the robot begins so far from the middle, along each axis."""
 
 
 class VisitTask(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -35,8 +38,8 @@ class VisitTask(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """Begin the episode of `seed`; ``info["goal"]`` holds the places of robot and stations."""
         super().reset(seed=seed)  # makes self.np_random, from which all that is random must come
-        self._robot = self.np_random.uniform(-1, 1, 2)
-        self._stations = self.np_random.uniform(-1, 1, (3, 2))
+        self._robot = self.np_random.uniform(-SPREAD, SPREAD, 2)
+        self._stations = PLACES + self.np_random.uniform(-SPREAD, SPREAD, (3, 2))
         self._visits = 0
         return self._observation(), {"goal": np.append(self._robot, self._stations).tolist()}
 
