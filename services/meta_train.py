@@ -59,7 +59,7 @@ class Arguments:
     runs: Path = Path("runs")
     """The folder that the run's own folder is made in."""
     name: str | None = None
-    """Name of the run's folder; the preset's with the time if not given."""
+    """Name of the run's folder; the suite's and the preset's with the time if not given."""
     resume: str | None = None
     """Name or folder of a run to go on with, with its own settings."""
 
@@ -113,7 +113,7 @@ def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]
     early = peek(arguments, resume=str, runs=Path, preset=str, config=Path, suite=str, demos=str)
     if early.resume is None:
         given = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(arguments)))
-        kind = "-".join(filter(None, (given.suite, given.preset)))
+        kind = f"{given.experiment.suite.name}-{given.preset.rpartition('-')[2]}"
         folder = _new_run(given.name or f"{kind}-{datetime.now():%Y%m%d-%H%M%S}", given.runs)
         if (folder / "config.json").exists():
             raise ConfigError(f"--name: got {folder}, which holds a run; wanted a new name, or --resume {folder}")
