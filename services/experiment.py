@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from dmil_core.configs import ExperimentConfig
-from dmil_core.demonstrations import Demonstration, DemonstrationError, Standardisation
+from dmil_core.demonstrations import Demonstration, Standardisation
 from dmil_core.errors import RunError, UserError
 from dmil_core.methods.dmil import Dmil
 from dmil_core.networks import Parameters, flatten, unflatten
@@ -17,17 +17,17 @@ from dmil_core.outer_loop import OuterState
 from dmil_core.seeding import stream
 from dmil_core.statistics import share_entropy
 from services.checkpoints import Checkpoint, CheckpointError, Checkpoints, Manifest
+from services.collection import Collection
 from services.demo_store import DemoStore, TaskDemonstrations
 from services.evaluation import Evaluations, Evaluator, write_evaluation
 from services.failures import keeping_failures
 from services.progress import Bar, console
 from services.provenance import library_versions
 from services.ray_runner import RayRunner
-from services.recordings import check_dimensions, demonstrations, places_of
 from services.results import Split
 from services.rollouts import TrialOutcome
 from services.runners import Iteration, LocalRunner, Plan, Runner
-from services.suites.base import Attempt, TaskSuite
+from services.suites.base import TaskSuite
 from services.suites.registry import open_suite
 from services.summary import AGAINST_COLLAPSE, COLLAPSED, Evaluation
 from services.tracking import Tracker
@@ -46,10 +46,6 @@ RunnerKind = Literal["ray", "local"]
 OnNonfinite = Literal["stop", "skip"]
 COLLAPSED_ITERATIONS = 100
 """So long may one sub-skill take nearly all states before a warning."""
-CHUNK = 10
-"""Attempts of an expert in one call to a simulation worker."""
-PATIENCE = 10
-"""So many attempts for each wanted demonstration, then the expert is given up."""
 
 
 class NoWorkersError(UserError):
@@ -120,7 +116,7 @@ class Experiment:
         self.config = config
         self.suite: TaskSuite = open_suite(config.suite)
         self.store = store
-        self._places = self._find_places()
+        self._collection = Collection(config, self.suite, store)
 
     @property
     def tasks(self) -> list[tuple[Split, str]]:
@@ -134,109 +130,12 @@ class Experiment:
     # Demonstrations
 
     def collect(self, runner: Runner) -> dict[str, TaskDemonstrations]:
-        """Return every task's demonstrations, letting the experts make those that are not in the store.
-
-        The first successes in the order of the attempts' numbers are kept, so the outcome does not depend on who
-        simulates what.
+        """Return every task's demonstrations, see `Collection`.
 
         Raises:
             DemonstrationError: if an expert hardly ever succeeds, a task has none, or a data set cannot be used.
         """
-        names = list(dict.fromkeys(task for _, task in self.tasks))
-        settings = self.config.demonstrations
-        found = self._recorded()
-        ids = {task: self.store.dataset_id(task, self.suite, settings) for task in names if task not in found}
-        missing = []
-        for task, dataset_id in ids.items():
-            if (dataset := self.store.load(dataset_id, task)) is not None:
-                found[task] = self._checked(dataset)
-            elif self.suite.expert(task) is None:
-                raise DemonstrationError(
-                    f"demonstrations.source: got nothing for {task}, which has no scripted expert; wanted a data set: "
-                    f"--demos minari:{task}=ID"
-                )
-            else:
-                missing.append(task)
-        if missing:
-            for task, attempts in self._attempt(runner, missing).items():
-                solved = [index for index, attempt in enumerate(attempts) if attempt.solved_at is not None]
-                kept = solved[: settings.per_task]
-                found[task] = self.store.save(
-                    ids[task],
-                    task,
-                    [attempts[index] for index in kept],
-                    failed=kept[-1] + 1 - len(kept),
-                    settings={"protocol": self.suite.protocol, **settings.model_dump()},
-                )
-        return {task: found[task] for task in names}
-
-    def _checked(self, dataset: TaskDemonstrations) -> TaskDemonstrations:
-        """Return a stored data set that fits the suite, which may have been changed since."""
-        try:
-            check_dimensions(dataset.demonstrations[0], self.suite)
-        except DemonstrationError as error:
-            raise DemonstrationError(
-                f"{self.store.root / dataset.id}: {error}; remove it, or name in the suite's protocol what has changed"
-            ) from error
-        return dataset
-
-    def _find_places(self) -> dict[str, str]:
-        """Return where the demonstrations of those tasks are that the settings name a data set for."""
-        if self.config.demonstrations.source == "expert":
-            return {}
-        places, names = places_of(self.config.demonstrations.source), dict.fromkeys(task for _, task in self.tasks)
-        if unknown := [task for task in places if task not in names]:
-            raise DemonstrationError(
-                f"demonstrations.source: got data sets of {', '.join(unknown)}; {self.suite.name} has the tasks "
-                f"{', '.join(names)}; name the task that a data set is of: TASK=ID"
-            )
-        return places
-
-    def _recorded(self) -> dict[str, TaskDemonstrations]:
-        """Read the data sets that the settings name."""
-        settings, evaluation = self.config.demonstrations, self.config.evaluation
-        found = {task: demonstrations(task, at, self.suite, settings.per_task) for task, at in self._places.items()}
-        support = max(evaluation.shots) * evaluation.support_draws
-        for task, dataset in found.items():
-            wanted = settings.held_out + 1 if task in self.suite.train_tasks else support
-            if (got := len(dataset.demonstrations)) < wanted:
-                raise DemonstrationError(
-                    f"{dataset.id}: got {got} demonstrations of {task}; wanted at least {wanted}: {support} for "
-                    f"{evaluation.support_draws} support sets of {max(evaluation.shots)}, and for a meta-training task "
-                    "one more than demonstrations.held_out; record more, or lower that, evaluation.shots or "
-                    "evaluation.support_draws"
-                )
-        return found
-
-    def _attempt(self, runner: Runner, tasks: Sequence[str]) -> dict[str, list[Attempt]]:
-        """Return each task's attempts, in the order of their numbers, with enough successes among them."""
-        settings = self.config.demonstrations
-        attempts: dict[str, list[Attempt]] = {task: [] for task in tasks}
-
-        def lacking(task: str) -> int:
-            return settings.per_task - sum(attempt.solved_at is not None for attempt in attempts[task])
-
-        with Bar("collecting", len(tasks) * settings.per_task) as bar:
-            while open_tasks := [task for task in tasks if lacking(task) > 0]:
-                calls = []
-                for task in open_tasks:
-                    first = len(attempts[task])
-                    if first >= PATIENCE * settings.per_task:
-                        raise DemonstrationError(
-                            f"task {task}: its expert solved {settings.per_task - lacking(task)} of {first} attempts; "
-                            f"wanted {settings.per_task} demonstrations; take less noise or a longer horizon"
-                        )
-                    for start in range(first, first + lacking(task), CHUNK):
-                        numbers = range(start, min(start + CHUNK, first + lacking(task)))
-                        calls.append((task, numbers, settings))
-                results: dict[int, list[Attempt]] = {}
-                with keeping_failures(self.store.root, self.config):
-                    for index, made in runner.simulate("attempts", calls):
-                        results[index] = made
-                        bar.advance(sum(attempt.solved_at is not None for attempt in made), calls[index][0])
-                for index, call in enumerate(calls):
-                    attempts[call[0]] += results[index]
-        return attempts
+        return self._collection.collect(runner)
 
     def training_sets(self, data: Mapping[str, TaskDemonstrations]) -> dict[str, Sequence[Demonstration]]:
         """Return what meta-training may see: the demonstrations of its tasks, without those held out."""

@@ -43,6 +43,7 @@ FLOORS = {
     "services.actors": 5,
     "services.runners": 6,
     "services.ray_runner": 6,
+    "services.collection": 6,
     "services.evaluation": 6,
     "services.experiment": 6,
     "services.summary": 6,
