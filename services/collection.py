@@ -12,7 +12,7 @@ from services.recordings import check_dimensions, demonstrations, places_of
 from services.runners import Runner
 from services.suites.base import Attempt, TaskSuite
 
-__all__ = ["Collection"]
+__all__ = ["DemonstrationCollection"]
 
 CHUNK = 10
 """Attempts of an expert in one call to a simulation worker."""
@@ -20,7 +20,7 @@ PATIENCE = 10
 """So many attempts for each wanted demonstration, then the expert is given up."""
 
 
-class Collection:
+class DemonstrationCollection:
     """The demonstrations of all tasks of an experiment."""
 
     def __init__(self, config: ExperimentConfig, suite: TaskSuite, store: DemoStore) -> None:

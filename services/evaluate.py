@@ -29,6 +29,8 @@ class Arguments:
     checkpoint: Path
     """Folder of a checkpoint, or of a run, whose newest one is then taken."""
     evaluation: EvaluationConfig
+    tasks: tuple[str, ...] | None = None
+    """Adapt to these tasks alone, as meta-testing tasks; they need not be the run's, only of its kind of robot."""
     output: Path = Path("evaluation")
     """Folder for the rows, the summary and the report."""
     runner: RunnerKind = "ray"
@@ -47,6 +49,8 @@ def run(arguments: Sequence[str]) -> None:
     )
     given = parse(Arguments, __doc__ or "", arguments, Arguments(path, checkpoint.manifest.config.evaluation))
     config = with_evaluation(checkpoint.manifest.config, given.evaluation)
+    if given.tasks is not None:
+        config = config.model_copy(update={"suite": config.suite.model_copy(update={"test_tasks": given.tasks})})
     experiment = Experiment(config, DemoStore(data_root()))
     given.output.mkdir(parents=True, exist_ok=True)
     clock = Clock()
@@ -54,7 +58,7 @@ def run(arguments: Sequence[str]) -> None:
         clock.lap("start")
         data = experiment.collect(runner)
         clock.lap("collect")
-        evaluation = experiment.evaluate(runner, data, checkpoint, given.output)
+        evaluation = experiment.evaluate(runner, data, checkpoint, given.output, given.tasks)
         clock.lap("evaluate")
     summary = summarise(evaluation, seconds=clock.seconds, folder=given.output)
     write_report(summary, given.output)

@@ -1,6 +1,6 @@
 """One experiment, put together from its config once, for all programs: collect, meta-train, evaluate."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
@@ -17,7 +17,7 @@ from dmil_core.outer_loop import OuterState
 from dmil_core.seeding import stream
 from dmil_core.statistics import share_entropy
 from services.checkpoints import Checkpoint, CheckpointError, Checkpoints, Manifest
-from services.collection import Collection
+from services.collection import DemonstrationCollection
 from services.demo_store import DemoStore, TaskDemonstrations
 from services.evaluation import Evaluations, Evaluator, write_evaluation
 from services.failures import keeping_failures
@@ -116,7 +116,7 @@ class Experiment:
         self.config = config
         self.suite: TaskSuite = open_suite(config.suite)
         self.store = store
-        self._collection = Collection(config, self.suite, store)
+        self._collection = DemonstrationCollection(config, self.suite, store)
 
     @property
     def tasks(self) -> list[tuple[Split, str]]:
@@ -130,7 +130,7 @@ class Experiment:
     # Demonstrations
 
     def collect(self, runner: Runner) -> dict[str, TaskDemonstrations]:
-        """Return every task's demonstrations, see `Collection`.
+        """Return every task's demonstrations, see `DemonstrationCollection`.
 
         Raises:
             DemonstrationError: if an expert hardly ever succeeds, a task has none, or a data set cannot be used.
@@ -277,13 +277,23 @@ class Experiment:
     # Evaluation
 
     def evaluate(
-        self, runner: Runner, data: Mapping[str, TaskDemonstrations], checkpoint: Checkpoint, folder: Path
+        self,
+        runner: Runner,
+        data: Mapping[str, TaskDemonstrations],
+        checkpoint: Checkpoint,
+        folder: Path,
+        only: Collection[str] | None = None,
     ) -> Evaluation:
         """Adapt a checkpoint to every task of both splits, and return a row for each episode and adaptation.
 
-        The rows are also written to ``episodes.jsonl`` and ``adaptations.jsonl`` in `folder`.
+        Args:
+            runner: does the work.
+            data: every task's demonstrations.
+            checkpoint: what is adapted.
+            folder: the rows are also written to ``episodes.jsonl`` and ``adaptations.jsonl`` in it.
+            only: of all tasks, those to adapt to.
         """
-        evaluator = self.evaluator(runner, data)
+        evaluator = self.evaluator(runner, data, only)
         outcomes: dict[int, TrialOutcome] = {}
         successes = 0
         episodes = sum(len(trial.episodes) for trial in evaluator.trials)
@@ -297,9 +307,12 @@ class Experiment:
         write_evaluation(evaluation, folder)
         return evaluation
 
-    def evaluator(self, runner: Runner, data: Mapping[str, TaskDemonstrations]) -> Evaluator:
-        """Return what evaluates the checkpoints of this experiment."""
-        return Evaluator(runner, self.config, self.suite, self.tasks, data, self.held_out_sets(data))
+    def evaluator(
+        self, runner: Runner, data: Mapping[str, TaskDemonstrations], only: Collection[str] | None = None
+    ) -> Evaluator:
+        """Return what evaluates the checkpoints of this experiment, on some tasks only if they are given."""
+        tasks = [named for named in self.tasks if only is None or named[1] in only]
+        return Evaluator(runner, self.config, self.suite, tasks, data, self.held_out_sets(data))
 
 
 def _same_data(resume: Checkpoint | None, digests: Mapping[str, str], store: DemoStore) -> None:

@@ -36,6 +36,7 @@ def test_adaptation(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_simulation(tmp_path: Path) -> None:
     rows = rows_of("simulation", "--quick", folder=tmp_path)
     *steps, median, evaluation = rows
@@ -48,6 +49,7 @@ def test_simulation(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_scaling(tmp_path: Path) -> None:
     rows = rows_of("scaling", "--sizes", "quick", "--rounds", "1", "--simulate", "100", folder=tmp_path)
     assert [(row["runner"], row["workers"], row["size"]) for row in rows] == [
@@ -61,6 +63,7 @@ def test_scaling(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_tracking(tmp_path: Path) -> None:
     rows = rows_of("tracking", "--rounds", "1", "--iterations", "2", folder=tmp_path)
     assert [row["mlflow"] for row in rows] == ["no tracking", "down", "slow", "up (SQLite)", "no tracking, again"]
@@ -74,6 +77,7 @@ def test_tracking(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.timeout(1800)
 def test_faults(tmp_path: Path) -> None:
     found = rows_of("faults", "--kills", "20", "--seed", "1", "--folder", str(tmp_path / "campaign"), folder=tmp_path)

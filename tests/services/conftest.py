@@ -41,10 +41,10 @@ SECONDS_TO_START = 90
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Count what needs the cluster among the slow tests: the quick ones run in several processes."""
+    """Mark what works on the session's cluster: there is one, with workers for every core."""
     for item in items:
         if "cluster" in getattr(item, "fixturenames", ()):
-            item.add_marker(pytest.mark.slow)
+            item.add_marker(pytest.mark.alone)
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,7 @@ import pytest
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import DemonstrationError
 from dmil_core.errors import RunError
-from services.collection import Collection
+from services.collection import DemonstrationCollection
 from services.demo_store import DemoStore
 from services.runners import LocalRunner
 from services.suites.base import Expert
@@ -35,11 +35,11 @@ def test_what_is_collected_before_a_fault_is_kept(tmp_path: Path):
     config, store = ExperimentConfig.model_validate(SETTINGS), DemoStore(tmp_path)
     suite = HalfBroken(config.suite)
     with pytest.raises(RunError, match=r"task push, attempt 0, seed \d+: ArithmeticError: out of numbers"):
-        Collection(config, suite, store).collect(LocalRunner(suite))
+        DemonstrationCollection(config, suite, store).collect(LocalRunner(suite))
     kept = store.load(store.dataset_id("reach", suite, config.demonstrations), "reach")
     assert kept is not None
     assert len(kept.demonstrations) == 3
-    whole = Collection(config, MetaWorldSuite(config.suite), store)
+    whole = DemonstrationCollection(config, MetaWorldSuite(config.suite), store)
     found = whole.collect(LocalRunner(MetaWorldSuite(config.suite)))
     assert list(found) == ["reach", "push"]
     assert found["reach"].digest == kept.digest
@@ -49,5 +49,5 @@ def test_an_expert_that_never_succeeds_is_given_up(tmp_path: Path):
     config = ExperimentConfig.model_validate(SETTINGS | {"suite": {**SETTINGS["suite"], "horizon": 3}})
     suite = MetaWorldSuite(config.suite)
     with pytest.raises(DemonstrationError, match="task reach: its expert solved 0 of 30 attempts; wanted 3 demonstra"):
-        Collection(config, suite, DemoStore(tmp_path)).collect(LocalRunner(suite))
+        DemonstrationCollection(config, suite, DemoStore(tmp_path)).collect(LocalRunner(suite))
     assert not list(tmp_path.rglob("*.hdf5"))

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 from services import evaluate
+from services.demo_store import DemoStore
+from services.results import EpisodeResult, read_rows
 
 
 @pytest.fixture
@@ -36,6 +38,17 @@ def test_settings_of_the_evaluation_may_differ():
 
 
 @pytest.mark.usefixtures("trained")
+def test_other_tasks_are_meta_testing_tasks(store: DemoStore):
+    evaluate.run(["--checkpoint", "runs/run", "--runner", "local", "--tasks", "push-around-wall"])
+    rows = read_rows(Path("evaluation/episodes.jsonl"), EpisodeResult)
+    assert {(row.suite, row.split, row.task, row.shots) for row in rows} == {
+        ("ml10-part", "meta-testing", "push-around-wall", 1)
+    }
+    (folder,) = store.root.glob("metaworld/push-around-wall/*")
+    assert (folder / "SHA256SUMS").is_file(), "its demonstrations are collected for it"
+
+
+@pytest.mark.usefixtures("trained")
 def test_a_second_evaluation_replaces_the_rows_of_the_first():
     for _ in range(2):
         evaluate.run(["--checkpoint", "runs/run", "--runner", "local"])
@@ -52,9 +65,10 @@ def test_a_second_evaluation_replaces_the_rows_of_the_first():
             ("--checkpoint", "runs/run", "--evaluation.episodes", "0"),
             ("episodes", "input_value=0", "greater than or equal to 1"),
         ),
+        (("--checkpoint", "runs/run", "--tasks", "fly"), ("suite.test_tasks", "got fly", "reach")),
         ((), ("--checkpoint",)),
     ],
-    ids=["missing", "damaged", "more shots than held out", "no episode", "not given"],
+    ids=["missing", "damaged", "more shots than held out", "no episode", "unknown task", "not given"],
 )
 def test_a_mistake_is_answered_with_what_is_allowed(complaint, trained: Path, arguments, words):
     if "parameters.safetensors" in words[0]:

@@ -45,6 +45,7 @@ def pid_of(actor) -> int:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.usefixtures("joined")
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_lost_learner_changes_nothing(small: Experiment, data, how: int, monkeypatch: pytest.MonkeyPatch):
@@ -63,6 +64,7 @@ def test_a_lost_learner_changes_nothing(small: Experiment, data, how: int, monke
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.usefixtures("joined")
 def test_what_was_done_since_the_last_state_is_done_again(small: Experiment, data):
     wanted = alone(small, data)
@@ -81,6 +83,7 @@ def test_what_was_done_since_the_last_state_is_done_again(small: Experiment, dat
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.usefixtures("joined")
 def test_a_hung_worker_is_overtaken_and_the_log_says_so(
     small: Experiment, data, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -103,6 +106,7 @@ def test_a_hung_worker_is_overtaken_and_the_log_says_so(
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.usefixtures("joined")
 def test_a_slot_that_ends_its_workers_is_named(small: Experiment, data):
     class Deadly(Dmil):
@@ -129,6 +133,7 @@ def test_a_slot_that_ends_its_workers_is_named(small: Experiment, data):
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.usefixtures("joined")
 def test_a_trial_that_ends_its_workers_is_named(
     train, workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -163,6 +168,7 @@ def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[Nodes]:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_nodes_may_leave_and_join(config: ExperimentConfig, store: DemoStore, data, nodes: Nodes):
     several = Experiment(training(config, 7, 1), store)
     wanted = alone(several, data)
@@ -238,6 +244,7 @@ def test_an_error_is_told_with_the_command_that_repeats_it(
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.usefixtures("joined")
 def test_an_error_in_a_worker_arrives_whole(small: Experiment, data):
     class Failing(Dmil):

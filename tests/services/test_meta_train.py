@@ -194,8 +194,8 @@ def descendants(session: str) -> list[psutil.Process]:
     [
         ("local", signal.SIGINT, 130),
         ("local", signal.SIGTERM, 143),
-        pytest.param("ray", signal.SIGINT, 130, marks=pytest.mark.slow),
-        pytest.param("ray", signal.SIGTERM, 143, marks=pytest.mark.slow),
+        pytest.param("ray", signal.SIGINT, 130, marks=[pytest.mark.slow, pytest.mark.alone]),
+        pytest.param("ray", signal.SIGTERM, 143, marks=[pytest.mark.slow, pytest.mark.alone]),
     ],
 )
 def test_a_stopped_run_goes_on_with_the_same_bits(

@@ -67,6 +67,7 @@ def test_loopback_is_told_from_the_rest(address: str, wanted: bool):
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_cluster_as_the_readme_starts_it_listens_on_loopback(cluster):
     port = int(cluster.address.rpartition(":")[2])
     head = next(
@@ -93,6 +94,7 @@ sys.exit(exit_code(meta_train.run, sys.argv[1:]))
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_run_on_ray_listens_on_loopback_and_keeps_its_secrets_when_it_fails(
     workplace: Path, short_folder: Path, free_port, wait_for, monkeypatch
 ):
@@ -129,6 +131,7 @@ def test_a_run_on_ray_listens_on_loopback_and_keeps_its_secrets_when_it_fails(
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_whole_run_keeps_its_secrets(programs, train, workplace: Path, monkeypatch):
     planted = secrets.token_hex(32)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{workplace / 'store.db'}")
@@ -181,6 +184,7 @@ def test_a_refused_tracker_tells_no_secret(tmp_path: Path, where: str, scheme: s
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.parametrize(
     ("environment", "refusal"),
     [

@@ -135,6 +135,7 @@ def slow_server() -> Iterator[tuple[str, threading.Event]]:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_slow_server_is_not_waited_for(
     slow_server: tuple[str, threading.Event], tmp_path: Path, mlflow_file: str, monkeypatch
 ):
@@ -174,6 +175,7 @@ Delivery(Path(sys.argv[1]), sys.argv[2]).deliver()
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_what_mlflow_took_before_a_kill_kept_us_from_noting_it_is_there_once(
     tmp_path: Path, free_port, mlflow_file: str, monkeypatch
 ):
@@ -215,6 +217,7 @@ def delivered_two(identity: Identity) -> dict[str, object]:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_killed_run_that_goes_on_has_every_iteration_once(
     programs, train, wait_for, workplace: Path, mlflow_file: str
 ):
@@ -399,6 +402,7 @@ def test_an_address_is_shown_without_its_secrets(text: str, shown: str):
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_server_takes_records_also_those_of_the_time_it_was_away(server: Server, tmp_path: Path, wait_for):
     folder = tmp_path / "run"
     folder.mkdir()
