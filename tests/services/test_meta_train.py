@@ -102,13 +102,12 @@ def test_a_run_from_end_to_end(programs, workplace: Path, data, mlflow_file: str
     }  # fmt: skip
 
 
-def test_episodes_start_from_goals_that_no_demonstration_holds(workplace: Path, train, store, monkeypatch):
+def test_episodes_start_from_goals_that_no_demonstration_holds(workplace: Path, train, store, data, monkeypatch):
     train("run", "--training.iterations", "0", "--evaluation.episodes", "4", "--evaluation.shots", "1")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(store.root))
     episodes = rows(workplace / "runs" / "run")
-    for name in minari.list_local_datasets():
-        task = name.partition("/")[0]
-        kept = minari.load_dataset(name).storage.get_episode_metadata(range(12))
+    for task, dataset in data.items():
+        kept = minari.load_dataset(dataset.id).storage.get_episode_metadata(range(12))
         demonstrated = {tuple(episode["options"]["goal"]) for episode in kept}
         evaluated = {row.goal for row in episodes if row.task == task}
         assert len(demonstrated) == 12

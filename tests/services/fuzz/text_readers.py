@@ -69,7 +69,7 @@ class RowsReader:
             "learning_rate": 0.003, "versions": {"torch": "2.13.0"}, "steps": 30, "sub_skill_steps": [10, 20],
         }  # fmt: skip
         self.kinds: dict[type[EpisodeResult | AdaptationResult], bytes] = {}
-        own = {"episode": 0, "seed": 2**62, "goal": [0.1, -0.25], "success": True}
+        own = {"episode": 0, "seed": 2**62, "goal": [0.1, -0.25], "success": True, "score": 1}
         for kind, row in ((EpisodeResult, common | own), (AdaptationResult, common | {"agreeing": 3})):
             write_rows(self.path, [kind.model_validate(row | {"draw": draw}) for draw in range(3)])
             self.kinds[kind] = self.path.read_bytes()
