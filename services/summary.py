@@ -222,7 +222,8 @@ def table(summary: Summary) -> Table:
     head, *rows = _table(summary)
     view = Table(title=f"Success rates ({summary.protocol}; seed {summary.seed})")
     for column in head:
-        view.add_column(column, justify="left" if column in ("suite", "split") else "right")
+        named = column in ("suite", "split")
+        view.add_column(column, justify="left" if named else "right", no_wrap=named)
     for row in rows:
         view.add_row(*row)
     return view
@@ -242,8 +243,10 @@ def table_markdown(summary: Summary) -> str:
 def _table(summary: Summary) -> list[list[str]]:
     """Return head and rows; columns that no row has anything in are left out."""
     columns = ["suite", "split", "shots", "successes", "success rate", "95% interval"]
-    columns += ["score", "95% interval of the score", f"best {BEST} of each task", "paper"]
     rows = [_fields(cell) for cell in summary.rows]
+    best = max((cell.score.best for cell in summary.rows if cell.score), default=1)
+    tables = {cell.paper.table for cell in summary.rows if cell.paper}
+    columns += [f"score of {best}", "95% interval", f"best {BEST} a task", ", ".join(["paper", *sorted(tables)])]
     kept = [index for index in range(len(columns)) if any(row[index] for row in rows)]
     return [[fields[index] for index in kept] for fields in (columns, *rows)]
 
@@ -255,13 +258,13 @@ def _fields(cell: Cell) -> list[str]:
     if (score := cell.score) is None:
         fields += ["", "", ""]
     elif score.low is None or score.high is None:
-        fields += [f"{score.mean:.2f} of {score.best}", "", f"{score.mean_of_best:.2f}"]
+        fields += [f"{score.mean:.2f}", "", f"{score.mean_of_best:.2f}"]
     else:
-        fields += [f"{score.mean:.2f} ± {score.deviation:.2f} of {score.best}", f"{score.low:.2f} to {score.high:.2f}"]
+        fields += [f"{score.mean:.2f} ± {score.deviation:.2f}", f"{score.low:.2f} to {score.high:.2f}"]
         fields.append(f"{score.mean_of_best:.2f}")
     paper = cell.paper
     digits = 3 if cell.score is None else 2
-    return [*fields, "" if paper is None else f"{paper.value:.{digits}f} ± {paper.spread:.{digits}f} ({paper.table})"]
+    return [*fields, "" if paper is None else f"{paper.value:.{digits}f} ± {paper.spread:.{digits}f}"]
 
 
 def _of_task(cell: Cell, task: str) -> str:
