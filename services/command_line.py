@@ -188,8 +188,9 @@ def parse(program: type[T], description: str, arguments: Sequence[str], defaults
     Raises:
         ConfigError: for a value that a setting does not allow; what is no flag at all ends with exit code 2.
     """
+    module = program.__module__ if program.__module__ != "__main__" else f"services.{Path(sys.argv[0]).stem}"
     try:
-        return tyro.cli(program, args=arguments, description=description, default=defaults)
+        return tyro.cli(program, prog=f"python -m {module}", args=arguments, description=description, default=defaults)
     except ValidationError as error:
         raise ConfigError(explain(error)) from error
 

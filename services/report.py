@@ -127,6 +127,11 @@ def run(arguments: Sequence[str]) -> None:
     Raises:
         ConfigError: if it names nothing that can be drawn.
     """
+    if arguments and arguments[0] in {"--help", "-h"}:
+        console.print("usage: python -m services.report KIND [--help]\n")
+        for kind, module in KINDS.items():
+            console.print(f"  {kind:10}{import_module(module).__doc__}", markup=False)
+        return
     if not arguments or arguments[0] not in KINDS:
         got = arguments[0] if arguments else "nothing"
         raise ConfigError(f"report: got {got}; wanted one of {', '.join(KINDS)}, each with a --help of its own")

@@ -132,6 +132,7 @@ def test_a_mistake_ends_the_program_with_exit_code_2(programs, arguments):
 def test_each_program_explains_itself(programs, name: str):
     code, printed = programs(name.replace("-", "_"), "--help")
     assert code == 0
+    assert f"usage: python -m services.{name.replace('-', '_')} " in printed
     assert "--runner" in printed
 
 

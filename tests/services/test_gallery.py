@@ -29,6 +29,11 @@ def test_the_gallery_has_a_picture_for_each_task(tmp_path: Path):
     assert high == pytest.approx(2 * two, abs=2)
 
 
+def test_the_program_says_what_it_draws(capsys: pytest.CaptureFixture[str]):
+    report.run(["--help"])
+    assert "gallery   Draw the tasks of every suite" in capsys.readouterr().out
+
+
 def test_a_report_that_there_is_not_is_told_in_words(complaint):
     assert "report: got pie; wanted one of gallery" in complaint(report.run, "pie")
     assert "report: got nothing" in complaint(report.run)
