@@ -50,6 +50,7 @@ def pid_of(actor) -> int:
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_lost_learner_changes_nothing(small: Experiment, data, how: int, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("services.actors.pool.OWN_SECONDS", 2.0)
+    monkeypatch.setattr("services.actors.pool.FIRST_SECONDS", 20.0)
     wanted = alone(small, data)
     with open_runner("ray", small.suite, 2) as runner:
         meta_training = runner.meta_train(plan_of(small, data))
