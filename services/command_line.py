@@ -50,7 +50,7 @@ def defaults_from(arguments: Sequence[str]) -> ExperimentConfig:
     """Return what ``--preset``, ``--suite``, ``--config`` and ``--demos`` in a program's arguments say all others are.
 
     Raises:
-        ConfigError: as `config_from`, and for arguments that leave open what is meant.
+        ConfigError: as `config_from`.
     """
     early = peek(arguments, preset=str, suite=str, config=Path, demos=str)
     config = config_from(early.preset or DEFAULT_PRESET, early.config, early.suite)

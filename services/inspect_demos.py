@@ -13,7 +13,7 @@ from rich.table import Table
 from dmil_core.demonstrations import Demonstration, DemonstrationError
 from services.command_line import exit_code, parse, suite_settings
 from services.progress import Bar, console
-from services.recordings import FORMS, Recording, read_recordings
+from services.recordings import FORMS, Recording, misfits, read_recordings
 from services.suites.base import TaskSuite
 from services.suites.registry import open_suite
 
@@ -95,9 +95,7 @@ def _problems(recordings: Sequence[Recording], suite: TaskSuite | None) -> Itera
             yield f"episode {index}: {error}"
             continue
         if suite is not None:
-            for field, wanted in (("observations", suite.obs_dim), ("actions", suite.action_dim)):
-                if (got := getattr(demonstration, field).shape[1]) != wanted:
-                    yield f"episode {index}: {field}: got {got} numbers a step; {suite.name} wants {wanted}"
+            yield from (f"episode {index}: {misfit}" for misfit in misfits(demonstration, suite))
         if (far := np.abs(one.actions).max()) > 1:
             yield f"episode {index}: actions of up to {far:.3g}; wanted -1 to 1: acting clips what lies outside"
         if len(one.actions) > 1 and not one.actions.std(axis=0).any():

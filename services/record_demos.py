@@ -19,6 +19,7 @@ from services.suites.registry import open_suite
 __all__ = ["Arguments", "run"]
 
 MOST = 10_000
+"""Demonstrations that are read, as many as an experiment may ask for."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Demonstrations that somebody else has recorded: Minari data sets, D4RL's HDF5 files, npz files (docs/data.md)."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from services.disk import inside
 from services.npz_demonstrations import read_npz
 from services.suites.base import TaskSuite
 
-__all__ = ["FORMS", "Recording", "check_dimensions", "demonstrations", "places_of", "read_recordings"]
+__all__ = ["FORMS", "Recording", "check_dimensions", "demonstrations", "misfits", "places_of", "read_recordings"]
 
 FORMS = ("minari", "hdf5", "npz")
 """What data sets may be: an id of Minari's, a file as D4RL has them, a file of arrays."""
@@ -110,9 +110,15 @@ def check_dimensions(demonstration: Demonstration, suite: TaskSuite) -> None:
     Raises:
         DemonstrationError: if it has not.
     """
+    for misfit in misfits(demonstration, suite):
+        raise DemonstrationError(misfit)
+
+
+def misfits(demonstration: Demonstration, suite: TaskSuite) -> Iterator[str]:
+    """Yield in words which of a demonstration's dimensions are not the suite's."""
     for field, wanted in (("observations", suite.obs_dim), ("actions", suite.action_dim)):
         if (got := getattr(demonstration, field).shape[1]) != wanted:
-            raise DemonstrationError(f"{field}: got {got} numbers a step; {suite.name} wants {wanted}")
+            yield f"{field}: got {got} numbers a step; {suite.name} wants {wanted}"
 
 
 def _read_minari(dataset_id: str) -> list[Recording]:
