@@ -69,11 +69,12 @@ def run(arguments: Sequence[str]) -> None:
 def _contests(given: Arguments) -> list[Contest]:
     config = settings("paper", given.sub_skills, "second")
     parameters, support = draw_parameters(config), draw_steps(0, given.shots, 100)
-    steps, rate, weight = given.fine_tuning_steps, 1e-3, config.continuity_weight
+    steps, rate = given.fine_tuning_steps, 1e-3
+    config = config.model_copy(update={"inner_learning_rate": rate})
     twin, hierarchy = MaskedTwin(config), Hierarchy.of(as_in_a_run(parameters))
 
     def ours() -> Hierarchy:
-        return adapt(hierarchy, support, support, steps=steps, learning_rate=rate, continuity_weight=weight).hierarchy
+        return adapt(hierarchy, support, support, config, steps=steps).hierarchy
 
     def theirs() -> dict[str, Tensor]:
         return {name: tensor.detach() for name, tensor in twin.adapt(parameters, support, steps, rate).items()}

@@ -50,14 +50,25 @@ class MaskedTwin:
         """Return argmax_k π_h(k|s)."""
         return self.network(tensors, "high", states).argmax(dim=1)
 
-    def high_loss(self, tensors: Parameters, steps: Steps) -> Float[Tensor, ""]:
-        """Return the cross-entropy to the labels, and λ times the expected switches."""
+    @torch.no_grad()
+    def targets(self, tensors: Parameters, steps: Steps, inner: bool) -> Float[Tensor, "steps sub_skills"]:
+        """Return the weight of each sub-skill at each step."""
+        errors, em = self.errors(tensors, steps), self.config.em
+        if em == "hard" or (em == "reference_soft" and not inner):
+            return functional.one_hot(errors.argmin(dim=0), self.config.sub_skills).to(errors.dtype)
+        density = torch.exp(-errors / (2 * self.config.posterior_deviation**2))
+        posterior = density / density.sum(dim=0)
+        return posterior.reshape(-1, len(errors)) if em == "reference_soft" else posterior.T
+
+    def high_loss(self, tensors: Parameters, steps: Steps, inner: bool) -> Float[Tensor, ""]:
+        """Return the cross-entropy to the targets, and λ times the expected switches."""
         log_p = functional.log_softmax(self.network(tensors, "high", steps.states), dim=1)
-        with torch.no_grad():
-            labels = self.errors(tensors, steps).argmin(dim=0)
-        loss = -(log_p * functional.one_hot(labels, self.config.sub_skills)).sum() / len(labels)
+        loss = -(log_p * self.targets(tensors, steps, inner)).sum() / len(log_p)
         if not self.config.continuity_weight:
             return loss
+        if self.config.continuity == "reference":
+            counts = [(z[1:] != z[:-1]).sum() / len(z) for z in log_p.argmax(1).split(steps.lengths.tolist())]
+            return loss + self.config.continuity_weight * torch.stack(counts).mean()
         switches = [(1 - (p[:-1] * p[1:]).sum(1)).sum() / len(p) for p in log_p.exp().split(steps.lengths.tolist())]
         return loss + self.config.continuity_weight * torch.stack(switches).mean()
 
@@ -79,8 +90,10 @@ class MaskedTwin:
     ) -> Parameters:
         """Return the adapted parameters."""
         for _ in range(steps):
-            tensors = self.descend(tensors, "high", self.high_loss(tensors, support_high), rate, graph)
-            tensors = self.descend(tensors, "low", self.low_loss(tensors, support_low), rate, graph)
+            if self.config.adapted in ("both", "high"):
+                tensors = self.descend(tensors, "high", self.high_loss(tensors, support_high, True), rate, graph)
+            if self.config.adapted in ("both", "low"):
+                tensors = self.descend(tensors, "low", self.low_loss(tensors, support_low), rate, graph)
         return tensors
 
     def gradient(self, parameters: Parameters, sets: Sets) -> tuple[Float[Tensor, " size"], float, float]:
@@ -90,7 +103,7 @@ class MaskedTwin:
         tensors = self.inner_loop(leaves, *sets[:2], config.inner_steps, config.inner_learning_rate, second)
         if not second:
             leaves = tensors = {name: tensor.detach().requires_grad_() for name, tensor in tensors.items()}
-        high, low = self.high_loss(tensors, sets[2]), self.low_loss(tensors, sets[3])
+        high, low = self.high_loss(tensors, sets[2], False), self.low_loss(tensors, sets[3])
         gradients = torch.autograd.grad(high + low, list(leaves.values()))
         return flatten(dict(zip(leaves, gradients, strict=True))), high.item(), low.item()
 

@@ -8,7 +8,16 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dmil_core.losses import Steps, behaviour_cloning_loss, high_level_loss, squared_errors, sub_skill_labels
+from dmil_core.configs import DmilConfig
+from dmil_core.losses import (
+    Steps,
+    Targets,
+    behaviour_cloning_loss,
+    high_level_loss,
+    soft_labels,
+    squared_errors,
+    sub_skill_labels,
+)
 from dmil_core.networks import Network, Parameters, bank, mlp, network, own_states, stacked
 from dmil_core.slopes import Slope, slope
 
@@ -22,6 +31,7 @@ __all__ = [
     "high_level_slope",
     "inner_loop",
     "label",
+    "outer_targets",
     "sub_skill_slopes",
 ]
 
@@ -51,7 +61,7 @@ class Hierarchy(NamedTuple):
 
 
 class InnerStep(NamedTuple):
-    """One step of the dual inner loop: what each level went down, and where they arrived."""
+    """One step of the dual inner loop: what each level goes down, if it is adapted, and where they arrived."""
 
     high: Slope
     low: Mapping[int, Slope]
@@ -70,6 +80,18 @@ class Adapted(NamedTuple):
 def label(low: Sequence[Network], steps: Steps) -> Int[Tensor, " steps"]:
     """Return for each step the sub-skill that explains its action best, the target of equation 3."""
     return sub_skill_labels(torch.stack([_errors(sub_skill, steps) for sub_skill in low]))
+
+
+def outer_targets(low: Sequence[Network], steps: Steps, config: DmilConfig) -> Targets:
+    """Return what the high level should predict in the outer loop, where the reference's labels are hard."""
+    errors = torch.stack([_errors(sub_skill, steps) for sub_skill in low])
+    return soft_labels(errors, config.posterior_deviation) if config.em == "soft" else sub_skill_labels(errors)
+
+
+def _inner_targets(errors: list[Float[Tensor, " steps"]], config: DmilConfig) -> Targets:
+    if config.em == "hard":
+        return sub_skill_labels(torch.stack(errors))
+    return soft_labels(torch.stack(errors), config.posterior_deviation, transposed=config.em == "soft")
 
 
 def _errors(sub_skill: Network, steps: Steps) -> Float[Tensor, " steps"]:
@@ -94,9 +116,10 @@ def act(
     return torch.cat(actions)[torch.cat(own).argsort()], chosen
 
 
-def high_level_slope(high: Network, steps: Steps, labels: Int[Tensor, " steps"], continuity_weight: float) -> Slope:
+def high_level_slope(high: Network, steps: Steps, targets: Targets, config: DmilConfig) -> Slope:
     """Return L_h of the high level on `steps` (equation 3 with Appendix C's term)."""
-    return slope(high, steps.states, lambda logits: high_level_loss(logits, labels, steps.lengths, continuity_weight))
+    weight, continuity = config.continuity_weight, config.continuity
+    return slope(high, steps.states, lambda logits: high_level_loss(logits, targets, steps.lengths, weight, continuity))
 
 
 def sub_skill_slopes(low: Sequence[Network], steps: Steps, chosen: Int[Tensor, " steps"]) -> dict[int, Slope]:
@@ -114,9 +137,8 @@ def inner_loop(
     hierarchy: Hierarchy,
     support_high: Steps,
     support_low: Steps,
+    config: DmilConfig,
     *,
-    learning_rate: float,
-    continuity_weight: float,
     keep: bool = False,
 ) -> Iterator[InnerStep]:
     """Go down both levels' losses in turn, step after step without end (Algorithm 1); `hierarchy` stays as it is.
@@ -124,44 +146,40 @@ def inner_loop(
     Args:
         hierarchy: where to start.
         support_high: τ1, which adapts the high level; its labels come from the current sub-skills.
-        support_low: τ2, which adapts each sub-skill on the states that the adapted high level gives it. At test
-            both are the support set.
-        learning_rate: α.
-        continuity_weight: λ of Appendix C.
+        support_low: τ2, which adapts each sub-skill on the states that the high level gives it by then. At test both
+            are the support set.
+        config: α, which levels are adapted, and to what; the other level stays as it is.
         keep: keep each step's networks as they were, for `Slope.pull_back`; else the next step overwrites them.
     """
     high, low = hierarchy
 
     def descend(slope: Slope, origin: Network) -> Network:
-        return slope.descend(learning_rate, in_place=not keep and slope.network is not origin)
+        return slope.descend(config.inner_learning_rate, in_place=not keep and slope.network is not origin)
 
     errors = [_errors(sub_skill, support_high) for sub_skill in low]
     while True:
-        labels = sub_skill_labels(torch.stack(errors))
-        of_high = high_level_slope(high, support_high, labels, continuity_weight)
-        high = descend(of_high, hierarchy.high)
+        of_high = high_level_slope(high, support_high, _inner_targets(errors, config), config)
+        if config.adapted != "low":
+            high = descend(of_high, hierarchy.high)
         of_low = sub_skill_slopes(low, support_low, choose(high, support_low.states))
-        low = tuple(descend(of_low[k], hierarchy.low[k]) if k in of_low else low[k] for k in range(len(low)))
+        if config.adapted != "high":
+            low = tuple(descend(of_low[k], hierarchy.low[k]) if k in of_low else low[k] for k in range(len(low)))
         yield InnerStep(of_high, of_low, Hierarchy(high, low))
-        # A sub-skill that was given no states is still the same.
-        errors = [_errors(low[k], support_high) if k in of_low else errors[k] for k in range(len(low))]
+        if config.adapted != "high":  # a sub-skill that was given no states is still the same
+            errors = [_errors(low[k], support_high) if k in of_low else errors[k] for k in range(len(low))]
 
 
 def adapt(
     hierarchy: Hierarchy,
     support_high: Steps,
     support_low: Steps,
+    config: DmilConfig,
     *,
     steps: int,
-    learning_rate: float,
-    continuity_weight: float,
 ) -> Adapted:
     """Run so many steps of the `inner_loop`."""
     high_losses, low_losses = [], []
-    loop = inner_loop(
-        hierarchy, support_high, support_low, learning_rate=learning_rate, continuity_weight=continuity_weight
-    )
-    for step in itertools.islice(loop, steps):
+    for step in itertools.islice(inner_loop(hierarchy, support_high, support_low, config), steps):
         hierarchy = step.adapted
         high_losses.append(step.high.loss.value.item())
         low_losses.append(sum(of_low.loss.value.item() for of_low in step.low.values()))

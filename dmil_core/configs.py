@@ -115,6 +115,17 @@ class DmilConfig(Settings):
     """Steps of the inner loop, Table 9's fine-tune iterations."""
     continuity_weight: NotNegative = 0.1
     """λ (Table 9; Appendix C says 1)."""
+    adapted: Literal["both", "high", "low"] = "both"
+    """Levels with an inner loop, which are also the ones adapted at test: both; high is DMIL-High and low is DMIL-Low,
+    where the outer loop trains the other level as it is (F.3)."""
+    em: Literal["hard", "soft", "reference_soft"] = "hard"
+    """What the high level learns to predict: the best-fitting sub-skill (equation 3); soft is DMIL_soft (E.6), the
+    posterior softmax(-|a - pi_k(s)|^2 / 2 sigma^2); reference_soft: that of the authors' released code."""
+    posterior_deviation: Positive = 0.5**0.5
+    """σ of the posterior; the paper names none: this one makes it the softmax of the negative squared errors."""
+    continuity: Literal["expected", "reference"] = "expected"
+    """The continuity loss: the expected switches, which have a gradient; or, as in the authors' released code, the
+    count of equation 15, which has none and so only adds to the loss that is shown."""
     order: Literal["first", "second"] = "second"
     """Of the meta-gradient: exact, or taken at the adapted parameters."""
     trajectories: Size = 16

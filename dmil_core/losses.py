@@ -1,7 +1,7 @@
 """The losses of DMIL: equations 3, 4 and 15 of the paper, and the labels that tie its two levels together."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -14,15 +14,20 @@ from dmil_core.demonstrations import Demonstration, Standardisation
 __all__ = [
     "OutputLoss",
     "Steps",
+    "Targets",
     "behaviour_cloning_loss",
     "continuity_loss",
     "cross_entropy",
     "differentiated",
     "high_level_loss",
+    "soft_labels",
     "squared_errors",
     "sub_skill_labels",
     "switching",
 ]
+
+Targets: TypeAlias = Int[Tensor, " steps"] | Float[Tensor, "steps sub_skills"]
+"""What the high level should predict at each step: a sub-skill, or a weight for each."""
 
 
 class Steps(NamedTuple):
@@ -87,32 +92,59 @@ def sub_skill_labels(errors: Float[Tensor, "sub_skills steps"]) -> Int[Tensor, "
     return errors.argmin(0)
 
 
-def cross_entropy(logits: Float[Tensor, "steps sub_skills"], labels: Int[Tensor, " steps"]) -> OutputLoss:
-    """Return the cross-entropy of π_h to the labels, averaged over the steps (equation 3)."""
-    log_probabilities, steps = logits.log_softmax(-1), len(labels)
+def soft_labels(
+    errors: Float[Tensor, "sub_skills steps"], deviation: float, *, transposed: bool = True
+) -> Float[Tensor, "steps sub_skills"]:
+    """Return the posterior of each sub-skill, softmax_k(−‖π_k(s_t) − a_t‖² / 2σ²): the E-step of the soft EM (E.6).
+
+    Args:
+        errors: squared, of each sub-skill at each step.
+        deviation: σ.
+        transposed: without it the matrix is read out row by row into one of the wanted shape, as in the authors'
+            released code: a step is then given the weights of other steps, which need not add up to 1.
+    """
+    posterior = (errors / (-2 * deviation**2)).softmax(0)
+    return posterior.T if transposed else posterior.reshape(posterior.shape[::-1])
+
+
+def cross_entropy(logits: Float[Tensor, "steps sub_skills"], targets: Targets) -> OutputLoss:
+    """Return the cross-entropy of π_h to the targets, averaged over the steps (equation 3)."""
+    log_probabilities, steps = logits.log_softmax(-1), len(targets)
     probabilities = log_probabilities.exp()
-    gradient = probabilities / steps
-    gradient[torch.arange(steps, device=labels.device), labels] -= 1 / steps
+    if targets.is_floating_point():
+        mass = targets.sum(-1, keepdim=True)
+        value, gradient = -(targets * log_probabilities).sum() / steps, (mass * probabilities - targets) / steps
+    else:
+        mass, value = 1, functional.nll_loss(log_probabilities, targets)
+        gradient = probabilities / steps
+        gradient[torch.arange(steps, device=targets.device), targets] -= 1 / steps
 
     def curvature(direction: Tensor) -> Tensor:
         weighted = probabilities * direction
-        return (weighted - probabilities * weighted.sum(-1, keepdim=True)) / steps
+        return mass * (weighted - probabilities * weighted.sum(-1, keepdim=True)) / steps
 
-    return OutputLoss(functional.nll_loss(log_probabilities, labels), gradient, curvature)
+    return OutputLoss(value, gradient, curvature)
 
 
 def high_level_loss(
     logits: Float[Tensor, "steps sub_skills"],
-    labels: Int[Tensor, " steps"],
+    targets: Targets,
     lengths: Int[Tensor, " trajectories"],
     continuity_weight: float,
+    continuity: Literal["expected", "reference"] = "expected",
 ) -> OutputLoss:
-    """Return the cross-entropy of π_h to the labels (equation 3) plus λ times the continuity loss (Appendix C)."""
-    loss = cross_entropy(logits, labels)
+    """Return the cross-entropy of π_h to the targets (equation 3) plus λ times the continuity loss (Appendix C).
+
+    The reference's continuity loss counts the switches of the most probable sub-skill and so has no gradient.
+    """
+    loss = cross_entropy(logits, targets)
     if not continuity_weight:
         return loss
-    continuity = differentiated(lambda outputs: continuity_loss(outputs.softmax(-1), lengths), logits)
-    return loss.plus(continuity, continuity_weight)
+    if continuity == "reference":
+        certain = functional.one_hot(logits.argmax(-1), logits.shape[-1]).to(logits.dtype)
+        return loss._replace(value=loss.value + continuity_weight * continuity_loss(certain, lengths))
+    expected = differentiated(lambda outputs: continuity_loss(outputs.softmax(-1), lengths), logits)
+    return loss.plus(expected, continuity_weight)
 
 
 def behaviour_cloning_loss(

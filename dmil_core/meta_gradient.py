@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dmil_core.adaptation import Hierarchy, choose, high_level_slope, inner_loop, label, sub_skill_slopes
+from dmil_core.adaptation import Hierarchy, choose, high_level_slope, inner_loop, label, outer_targets, sub_skill_slopes
 from dmil_core.configs import DmilConfig
 from dmil_core.losses import Steps, continuity_loss
 from dmil_core.networks import Parameters, unflatten
@@ -34,20 +34,17 @@ def task_gradient(
 ) -> TaskGradient:
     """Return ∇_θ [L_h(λ_h, τ3) + Σ_k L_BC(λ_lk, D_4k)] of one task (Algorithm 1).
 
-    λ_h and λ_l come from the dual inner loop on τ1 and τ2. With ``config.order == "first"`` the gradient is taken at
-    the adapted parameters (FOMAML, Finn et al. 2017). With ``"second"`` it is exact: each inner step's Jacobian
-    I − αH pulls it back to θ, the last step first. Labels and choices have no gradient, so each network's steps are a
-    chain of their own.
+    λ_h and λ_l come from the dual inner loop on τ1 and τ2; of a level that it does not adapt they are θ. With
+    ``config.order == "first"`` the gradient is taken at the adapted parameters (FOMAML, Finn et al. 2017). With
+    ``"second"`` it is exact: each inner step's Jacobian I − αH pulls it back to θ, the last step first. Targets and
+    choices have no gradient, so each network's steps are a chain of their own.
     """
     second, rate = config.order == "second", config.inner_learning_rate
-    weight = config.continuity_weight
-    start = Hierarchy.of(parameters)
-    loop = inner_loop(start, support_high, support_low, learning_rate=rate, continuity_weight=weight, keep=second)
+    loop = inner_loop(Hierarchy.of(parameters), support_high, support_low, config, keep=second)
     path = list(itertools.islice(loop, config.inner_steps))
     high, low = path[-1].adapted
 
-    labels = label(low, query_high)
-    of_high = high_level_slope(high, query_high, labels, weight)
+    of_high = high_level_slope(high, query_high, outer_targets(low, query_high, config), config)
     chosen = choose(high, query_low.states)
     of_low = sub_skill_slopes(low, query_low, chosen)
 
@@ -58,9 +55,11 @@ def task_gradient(
         outer.add_gradient(vector.low[k])
     if second:
         for step in reversed(path):
-            step.high.pull_back(vector.high, rate)
-            for k in step.low.keys() & of_low.keys():
-                step.low[k].pull_back(vector.low[k], rate)
+            if config.adapted != "low":
+                step.high.pull_back(vector.high, rate)
+            if config.adapted != "high":
+                for k in step.low.keys() & of_low.keys():
+                    step.low[k].pull_back(vector.low[k], rate)
 
     probabilities = of_high.outputs.softmax(-1)
     shares = torch.bincount(chosen, minlength=config.sub_skills) / len(chosen)
@@ -70,7 +69,7 @@ def task_gradient(
         "low_loss_before": _total(path[0].low),
         "low_loss_after": _total(of_low),
         "continuity_loss": continuity_loss(probabilities, query_high.lengths).item(),
-        "agreement": (probabilities.argmax(-1) == labels).float().mean().item(),
+        "agreement": (probabilities.argmax(-1) == label(low, query_high)).float().mean().item(),
         **{f"sub_skill_share/{k}": share for k, share in enumerate(shares.tolist())},
     }
     return TaskGradient(gradient, metrics)

@@ -4,7 +4,8 @@ A high-level network π_h(z|s) picks one of K sub-skills π_k(a|s) at each step.
 alternates
     θ_h ← θ_h − α ∇[CE(π_h, argmin_k ‖π_k(s) − a‖²) + λ L_aux]        on τ1 (equations 3 and 15),
     θ_k ← θ_k − α ∇ mean ‖π_k(s) − a‖² over {s : argmax π_h(s) = k}    on τ2 (equation 4),
-and the outer loop descends the same losses at the adapted parameters on τ3 and τ4.
+and the outer loop descends the same losses at the adapted parameters on τ3 and τ4. The paper's variants are settings:
+DMIL-High and DMIL-Low (F.3) adapt one level only, DMIL_nc (E.5) has λ = 0, DMIL_soft (E.6) a soft target for π_h.
 """
 
 from collections.abc import Mapping, Sequence
@@ -97,12 +98,6 @@ class Dmil:
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> DmilPolicy:
         """Run the dual inner loop with the support set as both τ1 and τ2."""
         steps = Steps.of(support, self.standardise)
-        adapted = adaptation.adapt(
-            Hierarchy.of(parameters),
-            steps,
-            steps,
-            steps=fine_tuning.steps,
-            learning_rate=fine_tuning.learning_rate,
-            continuity_weight=self.config.continuity_weight,
-        )
+        config = self.config.model_copy(update={"inner_learning_rate": fine_tuning.learning_rate})
+        adapted = adaptation.adapt(Hierarchy.of(parameters), steps, steps, config, steps=fine_tuning.steps)
         return DmilPolicy(adapted.hierarchy, self.standardise)

@@ -1,7 +1,6 @@
 """The dual inner loop: one step by hand, many against a plain twin, and what it must leave alone."""
 
 import itertools
-from typing import Any
 
 import pytest
 import torch
@@ -9,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional
 
+from benchmarks.masked_twin import MaskedTwin
 from dmil_core.adaptation import (
     Hierarchy,
     InnerStep,
@@ -20,10 +20,11 @@ from dmil_core.adaptation import (
     label,
     sub_skill_slopes,
 )
+from dmil_core.configs import DmilConfig
 from dmil_core.losses import Steps
 from dmil_core.networks import BLOCK, Network, Parameters, flatten
 
-SETTINGS: dict[str, Any] = {"learning_rate": 0.5, "continuity_weight": 0.3}
+CONFIG = DmilConfig(inner_learning_rate=0.5, continuity_weight=0.3)
 
 
 @pytest.fixture
@@ -130,8 +131,8 @@ def test_inputs_stay_bit_for_bit(parameters, support, steps: int, keep: bool, re
         tensor.requires_grad_(requires_grad)
     inputs = [*parameters.values(), *support[0], *support[1]]
     before = [tensor.detach().clone() for tensor in inputs]
-    path = list(itertools.islice(inner_loop(Hierarchy.of(parameters), *support, keep=keep, **SETTINGS), steps))
-    adapt(Hierarchy.of(parameters), *support, steps=steps, **SETTINGS)
+    path = list(itertools.islice(inner_loop(Hierarchy.of(parameters), *support, config=CONFIG, keep=keep), steps))
+    adapt(Hierarchy.of(parameters), *support, config=CONFIG, steps=steps)
     assert all(map(torch.equal, inputs, before))
     assert all(tensor.grad is None for tensor in inputs)
     assert not torch.equal(flat(path[-1].adapted), flat(Hierarchy.of(parameters)))
@@ -144,28 +145,28 @@ def test_the_start_stays_whenever_a_sub_skill_is_first_chosen(
 ) -> None:
     parameters = make_parameters(seed, sub_skills)
     before, support = flatten(parameters), make_steps(seed, [3, 1])
-    loop = inner_loop(Hierarchy.of(parameters), support, support, keep=keep, **SETTINGS)
+    loop = inner_loop(Hierarchy.of(parameters), support, support, config=CONFIG, keep=keep)
     for _ in itertools.islice(loop, 5):
         assert torch.equal(flatten(parameters), before)
 
 
 @pytest.mark.parametrize("steps", [1, 2, 5])
 def test_one_loss_of_each_level_for_each_step(parameters, hierarchy, support, steps: int) -> None:
-    adapted = adapt(hierarchy, *support, steps=steps, **SETTINGS)
+    adapted = adapt(hierarchy, *support, config=CONFIG, steps=steps)
     assert len(adapted.high_losses) == len(adapted.low_losses) == steps
     assert list(adapted.hierarchy.parameters) == list(parameters)
     assert not torch.equal(flatten(adapted.hierarchy.parameters), flatten(parameters))
 
 
 def test_no_step_changes_nothing(parameters, hierarchy, support) -> None:
-    adapted = adapt(hierarchy, *support, steps=0, **SETTINGS)
+    adapted = adapt(hierarchy, *support, config=CONFIG, steps=0)
     assert adapted.high_losses == adapted.low_losses == ()
     assert torch.equal(flatten(adapted.hierarchy.parameters), flatten(parameters))
 
 
 def test_an_adaptation_carries_no_graph(parameters, support) -> None:
     origin = Hierarchy.of({name: tensor.requires_grad_() for name, tensor in parameters.items()})
-    adapted = adapt(origin, *support, steps=2, **SETTINGS).hierarchy
+    adapted = adapt(origin, *support, config=CONFIG, steps=2).hierarchy
     moved = [k for k in range(3) if not torch.equal(adapted.low[k][0].weight, origin.low[k][0].weight)]
     assert moved
     assert not any(tensor.requires_grad for tensor in tensors(adapted.high, *(adapted.low[k] for k in moved)))
@@ -176,9 +177,8 @@ def test_an_adaptation_carries_no_graph(parameters, support) -> None:
 def test_keeping_the_networks_changes_no_bit(make_parameters, make_steps, seed: int, sub_skills: int) -> None:
     hierarchy = Hierarchy.of(make_parameters(seed, sub_skills, dtype=torch.float32))
     support = make_steps(seed, [2, 4], torch.float32), make_steps(seed + 1, [5], torch.float32)
-    kept, overwritten = (
-        inner_loop(hierarchy, *support, keep=keep, learning_rate=0.1, continuity_weight=0.3) for keep in (True, False)
-    )
+    config = DmilConfig(inner_learning_rate=0.1, continuity_weight=0.3)
+    kept, overwritten = (inner_loop(hierarchy, *support, config=config, keep=keep) for keep in (True, False))
     for one, other in itertools.islice(zip(kept, overwritten, strict=False), 5):
         assert one.low.keys() == other.low.keys()
         assert all(map(torch.equal, losses(one), losses(other)))
@@ -189,7 +189,7 @@ def test_keeping_the_networks_changes_no_bit(make_parameters, make_steps, seed: 
 def test_kept_slopes_hold_the_networks_of_their_own_step(hierarchy, support) -> None:
     path: list[InnerStep] = []
     arrived = [flat(hierarchy)]
-    for step in itertools.islice(inner_loop(hierarchy, *support, keep=True, **SETTINGS), 5):
+    for step in itertools.islice(inner_loop(hierarchy, *support, config=CONFIG, keep=True), 5):
         path.append(step)
         arrived.append(flat(step.adapted))
     assert not any(torch.equal(*two) for two in itertools.pairwise(arrived))
@@ -205,7 +205,7 @@ def test_kept_slopes_hold_the_networks_of_their_own_step(hierarchy, support) -> 
 
 def test_without_keeping_the_networks_are_overwritten(hierarchy, support) -> None:
     """What makes it fast: from its second step on a network's tensors are the same ones."""
-    path = list(itertools.islice(inner_loop(hierarchy, *support, **SETTINGS), 6))
+    path = list(itertools.islice(inner_loop(hierarchy, *support, config=CONFIG), 6))
     assert len({id(step.adapted.high[0].weight) for step in path}) == 1
     stepped = [k for k in range(3) if sum(k in step.low for step in path) > 1]
     assert stepped
@@ -242,7 +242,8 @@ def test_one_step_is_that_of_algorithm_1(parameters, hierarchy, support, plain_m
     )
     moved += [t.detach() - 0.5 * g for t, g in zip(low, torch.autograd.grad(low_loss, low), strict=True)]
 
-    adapted = adapt(hierarchy, first, second, steps=1, learning_rate=0.5, continuity_weight=continuity_weight)
+    config = DmilConfig(inner_learning_rate=0.5, continuity_weight=continuity_weight)
+    adapted = adapt(hierarchy, first, second, config, steps=1)
     expected = dict(zip(parameters, moved, strict=True))
     torch.testing.assert_close(adapted.hierarchy.parameters, expected, rtol=1e-12, atol=1e-12)
     assert adapted.high_losses == (pytest.approx(high_loss.item()),)
@@ -256,8 +257,8 @@ def test_many_steps_equal_a_twin_that_labels_everything_anew(
 ) -> None:
     parameters, count = make_parameters(1, sub_skills), 12
     support = make_steps(1, [5, 1, 7]), make_steps(2, [3, 4])
-    twin, seen, used = Twin(parameters, **SETTINGS), [], []
-    for step in itertools.islice(inner_loop(Hierarchy.of(parameters), *support, keep=keep, **SETTINGS), count):
+    twin, seen, used = Twin(parameters, CONFIG.inner_learning_rate, CONFIG.continuity_weight), [], []
+    for step in itertools.islice(inner_loop(Hierarchy.of(parameters), *support, config=CONFIG, keep=keep), count):
         labels, high, chosen, low = twin.step(*support)
         assert step.high.loss.value.item() == pytest.approx(high, rel=1e-9, abs=1e-12)
         assert set(step.low) == set(chosen)
@@ -272,7 +273,7 @@ def test_many_steps_equal_a_twin_that_labels_everything_anew(
         assert any(not (set(labels) <= skills) for labels, skills in zip(seen[1:], used, strict=False)), (
             "a label must come from a sub-skill that the step before left alone"
         )
-    adapted = adapt(Hierarchy.of(parameters), *support, steps=count, **SETTINGS)
+    adapted = adapt(Hierarchy.of(parameters), *support, config=CONFIG, steps=count)
     expected = {name: tensor.detach() for name, tensor in twin.tensors.items()}
     torch.testing.assert_close(adapted.hierarchy.parameters, expected, rtol=1e-9, atol=1e-11)
 
@@ -282,8 +283,8 @@ def test_many_steps_equal_a_twin_that_labels_everything_anew(
 def test_labels_follow_the_sub_skills_of_their_step(make_parameters, make_steps, seed: int, sub_skills: int) -> None:
     """Of sub-skills that come and go: each step's L_h is that of labels from scratch."""
     parameters, support = make_parameters(seed, sub_skills), (make_steps(seed, [4, 1]), make_steps(seed + 1, [3]))
-    twin = Twin(parameters, **SETTINGS)
-    for step in itertools.islice(inner_loop(Hierarchy.of(parameters), *support, **SETTINGS), 4):
+    twin = Twin(parameters, CONFIG.inner_learning_rate, CONFIG.continuity_weight)
+    for step in itertools.islice(inner_loop(Hierarchy.of(parameters), *support, config=CONFIG), 4):
         _, high, chosen, low = twin.step(*support)
         assert step.high.loss.value.item() == pytest.approx(high, rel=1e-7, abs=1e-9)
         assert set(step.low) == set(chosen)
@@ -338,7 +339,7 @@ def test_the_high_level_goes_down_its_loss(hierarchy, support, plain_mlp, gradie
     p = plain_mlp(tuple(zip(leaves[::2], leaves[1::2], strict=True)), steps.states).softmax(1)
     switches = [sum(1 - own[t] @ own[t + 1] for t in range(len(own) - 1)) / len(own) for own in p.split([5, 1, 7])]
     loss = -p[torch.arange(13), labels].log().mean() + continuity_weight * sum(switches) / 3
-    got = high_level_slope(hierarchy.high, steps, labels, continuity_weight)
+    got = high_level_slope(hierarchy.high, steps, labels, DmilConfig(continuity_weight=continuity_weight))
     torch.testing.assert_close(got.loss.value, loss.detach(), rtol=1e-12, atol=0)
     gradient = list(torch.autograd.grad(loss, leaves))
     torch.testing.assert_close(tensors(gradient_of(got)), gradient, rtol=1e-10, atol=1e-13)
@@ -360,9 +361,8 @@ def test_each_sub_skill_goes_down_the_average_over_its_own_states(hierarchy, sup
 
 def test_a_sub_skill_that_is_never_chosen_stays(parameters, support) -> None:
     biased = {**parameters, "high.2.bias": torch.tensor([0.0, 50.0, 0.0]).double()}
-    adapted = adapt(
-        Hierarchy.of(biased), *support, steps=2, learning_rate=0.01, continuity_weight=0.0
-    ).hierarchy.parameters
+    config = DmilConfig(inner_learning_rate=0.01, continuity_weight=0.0)
+    adapted = adapt(Hierarchy.of(biased), *support, config=config, steps=2).hierarchy.parameters
     for k in (0, 2):
         assert all(map(torch.equal, sub_skill(adapted, k), sub_skill(parameters, k)))
     assert not any(map(torch.equal, sub_skill(adapted, 1), sub_skill(parameters, 1)))
@@ -372,3 +372,23 @@ def test_acting_in_no_states_is_no_action(parameters, support) -> None:
     actions, chosen = act(Hierarchy.of(parameters), support[0].states[:0])
     assert actions.shape == (0, support[0].actions.shape[1])
     assert len(chosen) == 0
+
+
+@pytest.mark.parametrize(("adapted", "stays"), [("high", "low"), ("low", "high")])
+def test_a_level_that_is_not_adapted_stays_bit_for_bit(parameters, support, adapted: str, stays: str) -> None:
+    config = CONFIG.model_copy(update={"adapted": adapted})
+    after = adapt(Hierarchy.of(parameters), *support, config=config, steps=3).hierarchy.parameters
+    for name, tensor in parameters.items():
+        if name.startswith(stays):
+            assert torch.equal(after[name], tensor)
+    assert any(not torch.equal(after[name], tensor) for name, tensor in parameters.items() if name.startswith(adapted))
+
+
+@pytest.mark.parametrize("em", ["soft", "reference_soft"])
+@pytest.mark.parametrize("adapted", ["both", "high", "low"])
+def test_variants_adapt_as_the_plain_twin(make_parameters, make_steps, adapted: str, em: str) -> None:
+    parameters, support = make_parameters(2, 3), make_steps(1, [5, 1, 7])
+    config = DmilConfig.model_validate({"inner_learning_rate": 0.1, "adapted": adapted, "em": em})
+    got = adapt(Hierarchy.of(parameters), support, support, config, steps=4).hierarchy.parameters
+    wanted = MaskedTwin(config).adapt(parameters, support, 4, 0.1)
+    torch.testing.assert_close(got, {name: wanted[name].detach() for name in got}, rtol=1e-10, atol=1e-12)

@@ -15,8 +15,10 @@ from dmil_core.losses import (
     Steps,
     behaviour_cloning_loss,
     continuity_loss,
+    cross_entropy,
     differentiated,
     high_level_loss,
+    soft_labels,
     squared_errors,
     sub_skill_labels,
     switching,
@@ -226,3 +228,46 @@ def test_steps_of_one_demonstration_share_no_memory_with_it(make_demonstrations)
         tensor.zero_()
     assert (demonstration.observations == observed).all()
     assert (demonstration.actions == acted).all()
+
+
+@pytest.mark.parametrize("deviation", [0.3, 0.5**0.5, 2.0])
+def test_soft_labels_are_the_posterior_of_equal_gaussians(deviation: float) -> None:
+    errors = normal(SUB_SKILLS, 5).square()
+    labels = soft_labels(errors, deviation)
+    for step, column in enumerate(errors.T.tolist()):
+        densities = [math.exp(-error / (2 * deviation**2)) for error in column]
+        assert labels[step].tolist() == pytest.approx([density / sum(densities) for density in densities])
+    assert torch.equal(soft_labels(errors, 1e-3).argmax(1), sub_skill_labels(errors))
+
+
+def test_the_reference_soft_labels_mix_up_the_steps() -> None:
+    errors = normal(SUB_SKILLS, 5).square()
+    mixed, proper = soft_labels(errors, 1.0, transposed=False), soft_labels(errors, 1.0)
+    assert mixed.shape == proper.shape
+    assert mixed.flatten().tolist() == proper.T.flatten().tolist()
+    assert not torch.allclose(mixed.sum(1), torch.ones(5).double())
+
+
+@pytest.mark.parametrize("transposed", [True, False])
+def test_cross_entropy_to_soft_labels_equals_autograd(transposed: bool) -> None:
+    logits, direction = normal(5, SUB_SKILLS, seed=3), normal(5, SUB_SKILLS, seed=4)
+    labels = soft_labels(normal(SUB_SKILLS, 5).square(), 1.0, transposed=transposed)
+    got = cross_entropy(logits, labels)
+    twin = differentiated(lambda outputs: -(labels * outputs.log_softmax(-1)).sum(1).mean(), logits)
+    torch.testing.assert_close(got[:2], twin[:2], rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(got.curvature(direction), twin.curvature(direction), rtol=1e-12, atol=1e-14)
+
+
+def test_cross_entropy_to_certain_soft_labels_is_that_to_the_labels() -> None:
+    logits, labels = normal(5, SUB_SKILLS), torch.tensor([2, 0, 1, 1, 0])
+    certain = torch.nn.functional.one_hot(labels, SUB_SKILLS).double()
+    torch.testing.assert_close(cross_entropy(logits, certain)[:2], cross_entropy(logits, labels)[:2])
+
+
+def test_the_reference_continuity_loss_is_the_count() -> None:
+    logits, labels, lengths = normal(7, SUB_SKILLS), torch.tensor([0, 2, 1, 1, 0, 2, 2]), torch.tensor([3, 4])
+    plain, got = (high_level_loss(logits, labels, lengths, weight, "reference") for weight in (0.0, 0.5))
+    chosen = logits.argmax(1).tolist()
+    counts = [sum(a != b for a, b in itertools.pairwise(own)) / len(own) for own in (chosen[:3], chosen[3:])]
+    assert got.value.item() == pytest.approx(plain.value.item() + 0.5 * sum(counts) / 2)
+    assert torch.equal(got.gradient, plain.gradient)

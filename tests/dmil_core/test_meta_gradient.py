@@ -1,5 +1,6 @@
 """The outer gradient against a plain twin and against finite differences, and the tree that adds gradients."""
 
+import itertools
 from collections.abc import Callable, Sequence
 
 import pytest
@@ -53,6 +54,38 @@ def test_equals_the_plain_twin(
     assert relative_error(got.gradient, gradient) <= TOLERANCE[dtype]
     assert got.metrics["high_loss_after"] == pytest.approx(high, rel=TOLERANCE[dtype], abs=TOLERANCE[dtype])
     assert got.metrics["low_loss_after"] == pytest.approx(low, rel=TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("order", ["first", "second"])
+@pytest.mark.parametrize("continuity", ["expected", "reference"])
+@pytest.mark.parametrize("em", ["hard", "soft", "reference_soft"])
+@pytest.mark.parametrize("adapted", ["both", "high", "low"])
+def test_every_variant_equals_the_plain_twin(make_parameters, sets: Sets, adapted, em, continuity, order) -> None:
+    config = settings(
+        3, inner_steps=2, adapted=adapted, em=em, continuity=continuity, order=order, posterior_deviation=1.5
+    )
+    parameters = make_parameters(0, 3)
+    got, (gradient, high, low) = task_gradient(parameters, *sets, config), MaskedTwin(config).gradient(parameters, sets)
+    assert relative_error(got.gradient, gradient) <= 1e-10
+    assert got.metrics["high_loss_after"] == pytest.approx(high, rel=1e-10)
+    assert got.metrics["low_loss_after"] == pytest.approx(low, rel=1e-10)
+
+
+def test_every_variant_is_another(make_parameters, sets: Sets) -> None:
+    variants = [{}, {"adapted": "high"}, {"adapted": "low"}, {"em": "soft"}, {"em": "reference_soft"}]
+    variants += [{"em": "soft", "posterior_deviation": 0.1}, {"continuity": "reference"}]
+    gradients = [task_gradient(make_parameters(0, 3), *sets, settings(3, **variant)).gradient for variant in variants]
+    for one, other in itertools.combinations(gradients, 2):
+        assert relative_error(one, other) > 1e-4
+
+
+def test_the_reference_continuity_loss_has_no_gradient(make_parameters, sets: Sets) -> None:
+    without, reference = (
+        task_gradient(make_parameters(0, 3), *sets, settings(3, continuity="reference", continuity_weight=weight))
+        for weight in (0.0, 2.0)
+    )
+    assert torch.equal(without.gradient, reference.gradient)
+    assert reference.metrics["high_loss_after"] > without.metrics["high_loss_after"]
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE, ids=str)

@@ -63,7 +63,7 @@ def make_problem(make_parameters, make_steps) -> Callable[..., Problem]:
             loss = partial(behaviour_cloning_loss, actions=actions)
             return Problem(hierarchy.low[1], states, loss, partial(mean_squared_error, actions=actions))
         labels = torch.randint(SUB_SKILLS, (len(states),), generator=torch.Generator().manual_seed(seed))
-        of_logits: Any = partial(high_level_loss, labels=labels, lengths=counts, continuity_weight=weight)
+        of_logits: Any = partial(high_level_loss, targets=labels, lengths=counts, continuity_weight=weight)
         plain = partial(cross_entropy_and_switches, labels=labels, lengths=lengths, weight=weight)
         return Problem(hierarchy.high, states, of_logits, plain)
 

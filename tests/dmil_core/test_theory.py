@@ -9,8 +9,11 @@ from hypothesis import strategies as st
 from torch.distributions import Independent, Normal
 
 from dmil_core.adaptation import Hierarchy, adapt, choose, high_level_slope, label, sub_skill_slopes
+from dmil_core.configs import DmilConfig
 from dmil_core.losses import Steps
 from dmil_core.networks import Parameters, bank, mlp, network
+
+CONFIG = DmilConfig(inner_learning_rate=0.05, continuity_weight=0.0)
 
 SUB_SKILLS = 3
 
@@ -76,7 +79,7 @@ def test_theorem_2_cross_entropy_drives_the_mixture_to_its_maximum(leaves, steps
     maximum = log_likelihoods(leaves, steps, sigma).amax(0).mean()
     optimiser, gaps = torch.optim.Adam(itertools.chain(*high), lr=0.05), []
     for _ in range(600):
-        of_loss = high_level_slope(high, steps, labels, 0.0)
+        of_loss = high_level_slope(high, steps, labels, CONFIG)
         gaps.append((maximum - log_mixture(leaves, steps, sigma).mean()).item())
         assert 0 <= gaps[-1] <= of_loss.loss.value.item()
         for leaf, gradient in zip(itertools.chain(*high), itertools.chain(*gradient_of(of_loss)), strict=True):
@@ -88,7 +91,7 @@ def test_theorem_2_cross_entropy_drives_the_mixture_to_its_maximum(leaves, steps
 def test_theorem_2_the_high_gradients_agree_as_the_sub_skills_get_certain(leaves, steps, gradient_of) -> None:
     """Equation 21 holds in the limit of small σ, where the responsibilities become the labels."""
     high, low = Hierarchy.of(leaves)
-    of_loss = high_level_slope(high, steps, label(low, steps), 0.0)
+    of_loss = high_level_slope(high, steps, label(low, steps), CONFIG)
     descent = torch.cat([gradient.flatten() for gradient in itertools.chain(*gradient_of(of_loss))])
 
     def gap(sigma: float) -> float:
@@ -117,14 +120,14 @@ def test_lemma_1_one_inner_step_ascends_the_log_likelihood(linear, steps) -> Non
     inputs = torch.cat([steps.states, torch.ones(len(steps.states), 1).double()], 1)
     mean, variance = as_matrix(linear), len(inputs) / 2
     ascent = (steps.actions - inputs @ mean.T).T @ inputs / variance
-    adapted = adapt(Hierarchy.of(linear), steps, steps, steps=1, learning_rate=0.05, continuity_weight=0.0)
+    adapted = adapt(Hierarchy.of(linear), steps, steps, CONFIG, steps=1)
     torch.testing.assert_close(as_matrix(adapted.hierarchy.parameters), mean + 0.05 * ascent, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("inner_steps", [1, 3, 10])
 def test_lemma_1_early_stopping_is_the_map_estimate_of_a_gaussian_prior(linear, steps, inner_steps: int) -> None:
     """Equation 17 with the prior N(μ, Σ), Σ⁻¹ = H D⁻¹ (I − D) for D = I − (I − αH)ⁿ (Santos, Inverse Problems 1996)."""
-    rate, inputs = 0.05, torch.cat([steps.states, torch.ones(len(steps.states), 1).double()], 1)
+    rate, inputs = CONFIG.inner_learning_rate, torch.cat([steps.states, torch.ones(len(steps.states), 1).double()], 1)
     prior_mean, hessian = as_matrix(linear), 2 * inputs.T @ inputs / len(inputs)
     curvature, basis = torch.linalg.eigh(hessian)
     left = (1 - rate * curvature) ** inner_steps
@@ -134,5 +137,5 @@ def test_lemma_1_early_stopping_is_the_map_estimate_of_a_gaussian_prior(linear, 
     # The posterior's mode: (H + Σ⁻¹) λ = 2/N Xᵀ A + Σ⁻¹ μ.
     data = 2 * inputs.T @ steps.actions / len(inputs)
     mode = torch.linalg.solve(hessian + precision, data + precision @ prior_mean.T).T
-    adapted = adapt(Hierarchy.of(linear), steps, steps, steps=inner_steps, learning_rate=rate, continuity_weight=0.0)
+    adapted = adapt(Hierarchy.of(linear), steps, steps, CONFIG, steps=inner_steps)
     torch.testing.assert_close(as_matrix(adapted.hierarchy.parameters), mode, rtol=1e-9, atol=1e-10)
