@@ -32,7 +32,8 @@ from dmil_core.seeding import stream
 from services.actors.freight import pack
 from services.command_line import exit_code, parse
 from services.progress import console
-from services.ray_runner import FAN_IN, RayMetaTraining, RayRunner
+from services.ray_meta_training import FAN_IN, RayMetaTraining
+from services.ray_runner import RayRunner
 from services.runners import LocalMetaTraining, MetaTraining, Plan
 from services.suites.metaworld import MetaWorldSuite
 from services.timing import Timing

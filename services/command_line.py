@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import tyro
-import yaml
 from pydantic import ValidationError
 
 from dmil_core.configs import PRESETS, SIZES, EvaluationConfig, ExperimentConfig, SuiteConfig, preset_of
 from dmil_core.errors import RunError, UserError, explain, shown
-from services.disk import read_file
+from services.settings_files import ConfigError, merged, read_yaml
 
 __all__ = [
     "ConfigError",
+    "checked",
     "config_from",
     "defaults_from",
     "exit_code",
@@ -30,20 +30,11 @@ __all__ = [
 
 T = TypeVar("T")
 DEFAULT_SUITE, DEFAULT_PRESET = "ml10", "quick"
-MOST_BYTES = 2**16
-"""In a file of settings; PyYAML may need a second for so many."""
-DEEPEST = 20
-MOST_CHARACTERS = 500
-"""Of what PyYAML says."""
 PROGRAMS = {
     "meta-train": "collect demonstrations, meta-train, evaluate",
     "collect-demos": "let the scripted experts make demonstrations",
     "evaluate": "adapt a checkpoint to each task and measure its success rates",
 }
-
-
-class ConfigError(UserError):
-    """A setting that is unknown or has an impossible value."""
 
 
 def defaults_from(arguments: Sequence[str]) -> ExperimentConfig:
@@ -81,11 +72,8 @@ def config_from(preset: str, file: Path | None, suite: str | None = None) -> Exp
     except ValidationError as error:
         raise _no_name(suite) from error
     if file is not None:
-        given = _read_yaml(file)
-        if not isinstance(given, dict):
-            raise ConfigError(f"--config: got {file} with {type(given).__name__} in it; wanted keys with values")
-        _merge(settings, given, str(file), "")
-    return _checked(settings, "" if file is None else f"{file}: ")
+        settings = merged(settings, read_yaml(file, "--config"), str(file))
+    return checked(settings, "" if file is None else f"{file}: ")
 
 
 def suite_settings(suite: str, tasks: Sequence[str] | None = None) -> SuiteConfig:
@@ -106,62 +94,21 @@ def _no_name(suite: str | None) -> ConfigError:
     return ConfigError(f"--suite: got {shown(suite)}; wanted a name of letters, digits and hyphens, as ml10")
 
 
-class _PlainLoader(yaml.SafeLoader):
-    """Refuses aliases, a few lines of which stand for more than any memory holds, and deep nesting."""
-
-    depth = 0
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent) or self.depth == DEEPEST:
-            mark = self.peek_event().start_mark
-            raise yaml.MarkedYAMLError(
-                problem="found an alias or deep nesting, which no setting needs", problem_mark=mark
-            )
-        self.depth += 1
-        node = super().compose_node(parent, index)
-        self.depth -= 1
-        return node
-
-
-def _read_yaml(file: Path) -> Any:
-    try:
-        loader = _PlainLoader(read_file(file, MOST_BYTES).decode())
-        try:
-            return loader.get_single_data()
-        finally:
-            loader.dispose()
-    # Besides its own errors, PyYAML lets through what comes of dates, numbers and tags that are none.
-    except (OSError, yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError) as error:
-        raise ConfigError(f"--config: got {file}, {_cut(str(error))}; wanted a readable YAML file") from error
-
-
-def _cut(text: str) -> str:
-    return text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]}..."
-
-
 def with_evaluation(config: ExperimentConfig, evaluation: EvaluationConfig) -> ExperimentConfig:
     """Return `config` with another evaluation.
 
     Raises:
         ConfigError: if the two do not go together.
     """
-    return _checked({**config.model_dump(), "evaluation": evaluation.model_dump()})
+    return checked({**config.model_dump(), "evaluation": evaluation.model_dump()})
 
 
-def _merge(settings: dict[str, Any], given: dict[Any, Any], file: str, prefix: str) -> None:
-    for key, value in given.items():
-        if key not in settings:
-            named = key if isinstance(key, str) and len(key) < 50 else shown(key)
-            raise ConfigError(f"{file}: got the unknown key {prefix}{named}; wanted one of {', '.join(settings)}")
-        if isinstance(settings[key], dict):
-            if not isinstance(value, dict):
-                raise ConfigError(f"{file}: {prefix}{key}: got {shown(value)}; wanted keys: {', '.join(settings[key])}")
-            _merge(settings[key], value, file, f"{prefix}{key}.")
-        else:
-            settings[key] = value
+def checked(settings: dict[str, Any], origin: str = "") -> ExperimentConfig:
+    """Return the experiment of these settings.
 
-
-def _checked(settings: dict[str, Any], origin: str = "") -> ExperimentConfig:
+    Raises:
+        ConfigError: names the settings that are wrong, each behind `origin`.
+    """
     try:
         return ExperimentConfig.model_validate(settings)
     except ValidationError as error:

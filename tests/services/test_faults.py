@@ -24,7 +24,7 @@ from services.command_line import exit_code
 from services.demo_store import DemoStore, TaskDemonstrations
 from services.experiment import CollapseWatch, Experiment, open_runner
 from services.failures import read_failure
-from services.ray_runner import RayMetaTraining
+from services.ray_meta_training import RayMetaTraining
 from services.runners import LocalRunner
 from services.suites.base import Attempt
 from tests.services.courses import ITERATIONS, alone, assert_same_bits, follow, plan_of, training

@@ -14,7 +14,7 @@ from services.actors.freight import PIECE, pack, unpack
 from services.actors.learner import Learner
 from services.demo_store import DemoStore
 from services.experiment import Experiment, open_runner
-from services.ray_runner import RayMetaTraining
+from services.ray_meta_training import RayMetaTraining
 from services.results import EpisodeResult
 from services.runners import Runner
 from services.timing import Span, Timing
@@ -122,7 +122,7 @@ def test_a_killed_worker_changes_nothing(
             assert isinstance(meta_training, RayMetaTraining)
             meta_training._pool._workers[0].actor.__ray_call__.remote(lambda worker: worker._die_once())
 
-    monkeypatch.setattr("services.ray_runner.AdaptationWorker", Mortal)
+    monkeypatch.setattr("services.ray_meta_training.AdaptationWorker", Mortal)
     with open_runner("ray", experiment.suite, 2) as runner:
         meta_training = runner.meta_train(plan_of(experiment, data))
         disturbed = follow(meta_training, disturb=kill)
@@ -142,7 +142,7 @@ def test_the_learner_receives_one_gradient(
             assert [len(piece) for piece in gradient] == [len(piece) for piece in self.parameters()[1]]
             return super().step(gradient)
 
-    monkeypatch.setattr("services.ray_runner.Learner", Strict)
+    monkeypatch.setattr("services.ray_meta_training.Learner", Strict)
     experiment = Experiment(training(config, 9, 1), store)
     with open_runner("ray", experiment.suite, workers):
         meta_training = RayMetaTraining(plan_of(experiment, data), workers, fan_in=2)
