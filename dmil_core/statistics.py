@@ -5,9 +5,18 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import binomtest, entropy, t
+from scipy.stats import binomtest, entropy, t, trim_mean
 
-__all__ = ["MeanScore", "Rate", "mean_score", "share_entropy", "success_rate"]
+__all__ = [
+    "Interval",
+    "MeanScore",
+    "Rate",
+    "interquartile_mean",
+    "mean_score",
+    "share_entropy",
+    "stratified_bootstrap",
+    "success_rate",
+]
 
 
 class Rate(NamedTuple):
@@ -66,3 +75,42 @@ def share_entropy(shares: Float[np.ndarray, " sub_skills"]) -> float:
     One sub-skill alone has no choice to make; its entropy is 0.
     """
     return float(entropy(shares) / np.log(len(shares))) if len(shares) > 1 else 0.0
+
+
+class Interval(NamedTuple):
+    """A mean with its interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+BOOTSTRAP_DRAWS = 2000
+
+
+def stratified_bootstrap(
+    outcomes: Float[np.ndarray, "seeds tasks episodes"], draw: np.random.Generator, confidence: float = 0.95
+) -> Interval:
+    """Return the mean outcome with its percentile interval (Efron and Tibshirani 1993).
+
+    Seeds are drawn with replacement, then for each of them the episodes of each task: so the interval covers what
+    training and what the episodes have to do with chance, while every task keeps its weight.
+
+    Args:
+        outcomes: of each episode; differences of paired episodes are outcomes too.
+        draw: the stream of the resampling.
+        confidence: of the interval.
+    """
+    seeds, tasks, episodes = outcomes.shape
+    means = np.zeros((BOOTSTRAP_DRAWS, seeds))
+    for place in range(seeds):
+        chosen = outcomes[draw.integers(seeds, size=BOOTSTRAP_DRAWS)]
+        again = draw.integers(episodes, size=(BOOTSTRAP_DRAWS, tasks, episodes))
+        means[:, place] = np.take_along_axis(chosen, again, axis=2).mean((1, 2))
+    low, high = np.quantile(means.mean(1), [(1 - confidence) / 2, (1 + confidence) / 2])
+    return Interval(float(outcomes.mean()), float(low), float(high))
+
+
+def interquartile_mean(values: Sequence[float]) -> float:
+    """Return the mean of the middle half of `values` (Agarwal et al., NeurIPS 2021: of all runs on all tasks)."""
+    return float(trim_mean(values, 0.25))

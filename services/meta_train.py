@@ -15,12 +15,13 @@ import tyro
 from pydantic import ValidationError
 
 from dmil_core.configs import ExperimentConfig
-from dmil_core.errors import explain, shown
-from services.checkpoints import Checkpoint, CheckpointError, Checkpoints
+from dmil_core.errors import explain
+from services.checkpoints import Checkpoint, Checkpoints
 from services.command_line import DEFAULT_PRESET, ConfigError, defaults_from, exit_code, parse, peek
 from services.demo_store import DemoStore, data_root
-from services.disk import inside, read_file, write_file
+from services.disk import read_file, write_file
 from services.experiment import Experiment, OnNonfinite, RunnerKind, open_runner
+from services.folders import find_folder, new_folder
 from services.progress import Clock, console
 from services.report import publish, show, write_report
 from services.summary import summarise
@@ -30,8 +31,10 @@ __all__ = ["Arguments", "run"]
 
 CHANGEABLE = {"iterations", "checkpoint_every", "checkpoints_kept"}
 """Settings of meta-training that a resumed run may change without becoming another run."""
+MARK = "config.json"
+"""What a run's folder is known by."""
 MOST_BYTES = 2**20
-"""In a run's config.json."""
+"""In it."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ def run(arguments: Sequence[str]) -> None:
     checkpoints = Checkpoints(folder / "checkpoints", config.training.checkpoints_kept)
     clock = Clock()
     folder.mkdir(parents=True, exist_ok=True)
-    write_file(folder / "config.json", config.model_dump_json(indent=1) + "\n")
+    write_file(folder / MARK, config.model_dump_json(indent=1) + "\n")
     console.print(f"run: {folder}")
     tracker = Tracker(folder, f"dmil-{config.suite.name}", partial(console.print, markup=False))
     status = "FAILED"
@@ -114,18 +117,16 @@ def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]
     if early.resume is None:
         given = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(arguments)))
         kind = f"{given.experiment.suite.name}-{given.preset.rpartition('-')[2]}"
-        folder = _new_run(given.name or f"{kind}-{datetime.now():%Y%m%d-%H%M%S}", given.runs)
-        if (folder / "config.json").exists():
-            raise ConfigError(f"--name: got {folder}, which holds a run; wanted a new name, or --resume {folder}")
+        folder = new_folder(given.name or f"{kind}-{datetime.now():%Y%m%d-%H%M%S}", given.runs, MARK)
         return given, folder, None
     if early.preset or early.config or early.suite or early.demos:
         raise ConfigError(
             "--resume: got --preset, --config, --suite or --demos with it; wanted none: a run goes on with its own "
             "settings"
         )
-    folder = _find_run(early.resume, early.runs or Arguments.runs)
+    folder = find_folder(early.resume, early.runs or Arguments.runs, MARK)
     try:
-        before = ExperimentConfig.model_validate_json(read_file(folder / "config.json", MOST_BYTES))
+        before = ExperimentConfig.model_validate_json(read_file(folder / MARK, MOST_BYTES))
     except (OSError, ValidationError) as error:
         got = explain(error) if isinstance(error, ValidationError) else error
         raise ConfigError(f"{folder / 'config.json'}: {got}; start a new run") from error
@@ -133,33 +134,6 @@ def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]
     _same_run(before, given.experiment)
     saved = Checkpoints(folder / "checkpoints", given.experiment.training.checkpoints_kept)
     return given, folder, saved.newest() if saved.all() else None
-
-
-def _new_run(name: str, runs: Path) -> Path:
-    if name in (".", "..") or Path(name).name != name:
-        raise ConfigError(f"--name: got {shown(name)}; wanted the name of a folder in {runs}, without any /")
-    return _held(runs / name, runs, "--name")
-
-
-def _find_run(name: str, runs: Path) -> Path:
-    for folder in (Path(name), runs / name):
-        if (folder / "config.json").is_file():
-            return _held(folder, runs, "--resume")
-    raise CheckpointError(f"--resume: got {name!r}; wanted a run's folder, or the name of one in {runs}")
-
-
-def _held(folder: Path, runs: Path, flag: str) -> Path:
-    """Return a run's folder, unless it seems to lie in `runs` and is a link that leads elsewhere.
-
-    Raises:
-        ConfigError: then, because whatever the run writes would be written there.
-    """
-    if folder.parent.absolute() == runs.absolute():
-        try:
-            inside(runs, folder.name)
-        except OSError as error:
-            raise ConfigError(f"{flag}: got {folder}, a link out of {runs}; wanted a folder in it") from error
-    return folder
 
 
 def _same_run(before: ExperimentConfig, now: ExperimentConfig) -> None:

@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from services.results import Split
 
-__all__ = ["Published", "dmil_figure"]
+__all__ = ["Published", "dmil_figure", "figure"]
 
 BENCHMARKS = {"ml10": "ML10", "ml45": "ML45"}
 KITCHENS = ("kitchen-topburner", "kitchen-microwave", "kitchen-kettle", "kitchen-slide")
@@ -17,11 +17,16 @@ KITCHENS = ("kitchen-topburner", "kitchen-microwave", "kitchen-kettle", "kitchen
 
 
 class Published(BaseModel):
-    """A figure of the paper, with its spread as printed."""
+    """A figure of the paper, with its spread as printed, if one is."""
 
     value: float
-    spread: float
+    spread: float | None
     table: str
+
+    def in_words(self, digits: int) -> str:
+        """Return it to so many digits."""
+        spread = "" if self.spread is None else f" ± {self.spread:.{digits}f}"
+        return f"{self.value:.{digits}f}{spread}"
 
 
 @cache
@@ -29,16 +34,31 @@ def _tables() -> dict[str, Any]:
     return json.loads((files("services") / "published.json").read_text("utf-8"))
 
 
-def dmil_figure(suite: str, split: Split, shots: int, sub_skills: int) -> Published | None:
-    """Return the paper's figure for DMIL, if it has one: success rates (Table 4, K = 3), or scores (Table 5).
+def figure(table: str, row: str, suite: str, split: Split, shots: int) -> Published | None:
+    """Return the paper's figure, if it has one: a success rate (Tables 4, 6, 7, 8), or a score (Table 5).
 
-    Table 5 does not tell how many demonstrations were adapted to: its figures stand beside all.
+    Args:
+        table: as table4.
+        row: as the paper names it: a method or a variant, K=4, or a number of fine-tuning steps.
+        suite: as ml10 or kitchen-kettle.
+        split: of its tasks.
+        shots: demonstrations adapted to; Table 5 does not tell how many: its figures stand beside all.
     """
-    if suite in BENCHMARKS:
-        row, key = _tables()["table4"]["rows"]["DMIL"], f"{BENCHMARKS[suite]}/{split}/{shots}-shot"
-        found = row["mean"].get(key)
-        return None if found is None else Published(value=found, spread=row["spread"][key], table="Table 4")
-    if suite in KITCHENS and split == "meta-testing":
-        figure = _tables()["table5"]["rows"][KITCHENS.index(suite)].get(f"K={sub_skills}")
-        return None if figure is None else Published(value=figure[0], spread=figure[1], table="Table 5")
-    return None
+    found, title = _tables()[table]["rows"], f"Table {table.removeprefix('table')}"
+    if table == "table5":
+        if suite not in KITCHENS or split != "meta-testing" or row not in found[KITCHENS.index(suite)]:
+            return None
+        value, spread = found[KITCHENS.index(suite)][row]
+        return Published(value=value, spread=spread, table=title)
+    key, figures = f"{BENCHMARKS.get(suite)}/{split}/{shots}-shot", found.get(row, {})
+    means = figures.get("mean", figures)
+    if key not in means:
+        return None
+    return Published(value=means[key], spread=figures.get("spread", {}).get(key), table=title)
+
+
+def dmil_figure(suite: str, split: Split, shots: int, sub_skills: int) -> Published | None:
+    """Return the paper's figure for DMIL: success rates (Table 4, K = 3), or scores (Table 5)."""
+    if suite in KITCHENS:
+        return figure("table5", f"K={sub_skills}", suite, split, shots)
+    return figure("table4", "DMIL", suite, split, shots)

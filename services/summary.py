@@ -264,7 +264,7 @@ def _fields(cell: Cell) -> list[str]:
         fields.append(f"{score.mean_of_best:.2f}")
     paper = cell.paper
     digits = 3 if cell.score is None else 2
-    return [*fields, "" if paper is None else f"{paper.value:.{digits}f} ± {paper.spread:.{digits}f}"]
+    return [*fields, "" if paper is None else paper.in_words(digits)]
 
 
 def _of_task(cell: Cell, task: str) -> str:

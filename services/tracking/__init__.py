@@ -49,13 +49,14 @@ def in_words(error: Exception) -> str:
 class Tracker:
     """One MLflow run, fed from ``tracking.jsonl`` in the run's folder."""
 
-    def __init__(self, folder: Path, experiment: str, say: Callable[[str], None]) -> None:
+    def __init__(self, folder: Path, experiment: str, say: Callable[[str], None], parent: Path | None = None) -> None:
         """Open the MLflow run that belongs to a run's folder, or make one as soon as MLflow answers.
 
         Args:
             folder: of the run; a folder that was tracked before continues the same MLflow run.
             experiment: the MLflow experiment's name.
             say: where messages go: one when MLflow does not take records, one when some are left at the end.
+            parent: the folder of the sweep that this run is a trial of.
 
         Raises:
             SpoolError: if a record of the run so far is damaged.
@@ -66,7 +67,7 @@ class Tracker:
         self.uri = redacted(uri)
         """Of MLflow, without secrets."""
         self._folder, self._say = folder, say
-        Identity.found_or_made(folder, experiment)
+        Identity.found_or_made(folder, experiment, None if parent is None else Identity.of(parent).tag)
         self._spool = Spool(folder / "tracking.jsonl")
         self._delivery = Delivery(folder, uri)
         self._opened = time.monotonic()

@@ -14,15 +14,12 @@ from tyro.conf import Positional
 
 from dmil_core.errors import RunError, UserError
 from services.command_line import exit_code, parse
+from services.folders import find_folder
 from services.progress import console
 from services.tracking import in_words, redacted, tracking_uri
 from services.tracking.delivery import Delivery
 
-__all__ = ["Arguments", "NoRunError", "run"]
-
-
-class NoRunError(UserError):
-    """A folder that holds no tracked run."""
+__all__ = ["Arguments", "run"]
 
 
 @dataclass(frozen=True)
@@ -41,26 +38,18 @@ def run(arguments: Sequence[str]) -> None:
     """Run the program.
 
     Raises:
-        NoRunError: if there is no such run.
+        FolderError: if there is no such run.
         RunError: if MLflow does not take the records, or another process is delivering them.
     """
     given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, tyro.MISSING))
-    folder = _find(given.run, given.runs)
     uri = tracking_uri()
-    delivery = Delivery(folder, uri)
-    try:
-        _flush(delivery, folder, uri) if given.action == "flush" else _status(delivery)
-    finally:
-        delivery.close()
-
-
-def _find(name: str, runs: Path) -> Path:
-    for folder in (Path(name), runs / name):
-        if (folder / "tracking.jsonl").is_file():
-            return folder
-    raise NoRunError(
-        f"RUN: got {name!r}; wanted the folder of a run, which holds tracking.jsonl, or the name of one in {runs}"
-    )
+    folder = find_folder(given.run, given.runs, "tracking.jsonl", "RUN")
+    for own in (folder, *sorted(spool.parent for spool in folder.glob("trials/*/tracking.jsonl"))):  # of a sweep
+        delivery = Delivery(own, uri)
+        try:
+            _flush(delivery, own, uri) if given.action == "flush" else _status(delivery)
+        finally:
+            delivery.close()
 
 
 def _flush(delivery: Delivery, folder: Path, uri: str) -> None:

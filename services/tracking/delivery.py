@@ -23,6 +23,8 @@ __all__ = ["RUN_TAG", "BusyError", "Delivery", "Identity", "IdentityError"]
 
 RUN_TAG = "dmil.run"
 """The tag by which a run is found again whose id was never noted."""
+PARENT_TAG = "mlflow.parentRunId"
+"""MLflow's own, by which its pages nest runs."""
 SLOW_SECONDS = 5.0
 """A server that takes longer for a call is not waited for."""
 OPENING_SECONDS = 20.0
@@ -38,6 +40,10 @@ class BusyError(RunError):
     """Another process delivers the records of this run."""
 
 
+class ParentError(RunError):
+    """A trial whose sweep MLflow does not know yet."""
+
+
 class Identity(BaseModel):
     """Which MLflow run a folder belongs to and how far delivery got, ``mlflow_run.json``."""
 
@@ -49,6 +55,8 @@ class Identity(BaseModel):
     name: str
     began: int
     """In milliseconds since 1970."""
+    parent: str | None = None
+    """The tag of the run that this one is a trial of; it goes to the same MLflow experiment."""
     run_id: str | None = None
     delivered: int = 0
     """How many records MLflow has taken."""
@@ -71,15 +79,22 @@ class Identity(BaseModel):
             ) from error
 
     @staticmethod
-    def found_or_made(folder: Path, experiment: str) -> "Identity":
+    def found_or_made(folder: Path, experiment: str, parent: str | None = None) -> "Identity":
         """Read the identity of a run, or give it one.
+
+        Args:
+            folder: of the run.
+            experiment: the MLflow experiment's name.
+            parent: the tag of the run that this one is a trial of.
 
         Raises:
             IdentityError: if it is damaged.
         """
         path = folder / "mlflow_run.json"
         if not path.exists():
-            made = Identity(tag=uuid4().hex, experiment=experiment, name=folder.name, began=int(time.time() * 1000))
+            made = Identity(
+                tag=uuid4().hex, experiment=experiment, name=folder.name, began=int(time.time() * 1000), parent=parent
+            )
             write_file(path, made.model_dump_json())
         return Identity.of(folder)
 
@@ -216,16 +231,25 @@ class Delivery:
 
     def _run_in(self, client: "MlflowClient", experiment_id: str) -> str:
         """Return the id of our run: of one that was made before its id could be noted, or of a new one."""
-        tag = self._identity.tag
+        identity = self._identity
+        if (found := self._tagged(client, experiment_id, identity.tag)) is not None:
+            return found
+        tags = {RUN_TAG: identity.tag}
+        if identity.parent is not None:
+            parent = self._tagged(client, experiment_id, identity.parent)
+            if parent is None:
+                raise ParentError(
+                    f"{self._folder}: MLflow has not the run yet that this one is a trial of; flush that one first"
+                )
+            tags[PARENT_TAG] = parent
+        with self._asking():
+            return client.create_run(experiment_id, identity.began, tags=tags, run_name=identity.name).info.run_id
+
+    def _tagged(self, client: "MlflowClient", experiment_id: str, tag: str) -> str | None:
+        """Return the id of the run that has our own id `tag`."""
         with self._asking():
             found = client.search_runs([experiment_id], f"tags.`{RUN_TAG}` = '{tag}'", order_by=["created ASC"])
-        if found:
-            return found[0].info.run_id
-        with self._asking():
-            made = client.create_run(
-                experiment_id, self._identity.began, tags={RUN_TAG: tag}, run_name=self._identity.name
-            )
-        return made.info.run_id
+        return found[0].info.run_id if found else None
 
     @contextmanager
     def _asking(self) -> Iterator[None]:

@@ -1,0 +1,139 @@
+"""A sweep on disk: what it is, what came of each trial, and the trained configurations that sweeps share.
+
+::
+
+    runs/NAME/sweep.json                     what it is
+    runs/NAME/trials/TRIAL/result.json       what came of a trial, there once it is over
+    runs/trained/DIGEST/checkpoints          of one configuration on one set of demonstrations
+    runs/trained/DIGEST/evaluated/DIGEST     the rows of one evaluation of it
+"""
+
+from collections.abc import Mapping
+from datetime import datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from dmil_core.configs import EvaluationConfig, ExperimentConfig
+from dmil_core.errors import UserError, explain
+from services.digests import sha256
+from services.disk import inside, read_file, write_file
+from services.sweeps.settings import PlannedTrial, Size, Sweep, planned
+
+__all__ = ["MARK", "SweepError", "SweepFolder", "SweepRecord", "TrialResult", "evaluated", "trained"]
+
+Record = TypeVar("Record", bound=BaseModel)
+MOST_BYTES = 2**22
+MARK = "sweep.json"
+"""What a sweep's folder is known by."""
+TRAINED = "trained"
+DIGITS = 24
+"""Of a digest, in a folder's name."""
+
+
+class SweepError(UserError):
+    """A sweep's folder that is none, or is damaged."""
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SweepRecord(_Record):
+    """``sweep.json``."""
+
+    name: str
+    """Of the file."""
+    size: Size
+    suites: tuple[str, ...]
+    seeds: tuple[int, ...]
+    sweep: Sweep
+    began: datetime
+    command: str
+    commit: str
+    versions: dict[str, str]
+
+
+class TrialResult(_Record):
+    """``result.json``: how a trial ended."""
+
+    status: Literal["finished", "failed", "stopped"]
+    """Stopped: by a search, for others were better."""
+    error: str | None = None
+    trained: str | None = None
+    """Folder of the trained configuration, in the folder of all runs."""
+    evaluated: dict[str, str] = {}
+    """Folder of each evaluation's rows, in the folder of all runs, by the table's row."""
+    seconds: dict[str, float] = {}
+    iteration: int = 0
+    held_out: float | None = None
+    """What a search goes by: the mean over shots on the held-out tasks."""
+
+
+class SweepFolder:
+    """The folder of a sweep."""
+
+    def __init__(self, path: Path) -> None:
+        """Open it.
+
+        Raises:
+            SweepError: if it is no folder of a sweep.
+        """
+        self.path, self.runs = path, path.parent
+        self.record = _read(path / MARK, SweepRecord)
+
+    @classmethod
+    def make(cls, path: Path, record: SweepRecord) -> "SweepFolder":
+        """Make it, with what the sweep is."""
+        path.mkdir(parents=True, exist_ok=True)
+        write_file(path / MARK, record.model_dump_json(indent=1) + "\n")
+        return cls(path)
+
+    @cached_property
+    def trials(self) -> dict[str, PlannedTrial]:
+        """All trials by name."""
+        record = self.record
+        return {trial.name: trial for trial in planned(record.sweep, record.size, record.suites, record.seeds)}
+
+    def of_trial(self, name: str) -> Path:
+        """Return the folder of a trial, which may not be there yet."""
+        return inside(self.path / "trials", name)
+
+    def result(self, name: str) -> TrialResult | None:
+        """Return what came of a trial, if it is over.
+
+        Raises:
+            SweepError: if the record of it is damaged.
+        """
+        path = self.of_trial(name) / "result.json"
+        return _read(path, TrialResult) if path.exists() else None
+
+    def finish(self, name: str, result: TrialResult) -> None:
+        """Note what came of a trial."""
+        write_file(self.of_trial(name) / "result.json", result.model_dump_json(indent=1) + "\n")
+
+
+def trained(runs: Path, config: ExperimentConfig, data: Mapping[str, str]) -> Path:
+    """Return the folder of a configuration trained on demonstrations of these digests, by task.
+
+    Evaluations, and which checkpoints are kept, do not make it another; nor does who trains it.
+    """
+    described = config.model_dump_json(exclude={"evaluation": True, "training": {"checkpoints_kept"}})
+    digests = "".join(f"\n{task} {digest}" for task, digest in sorted(data.items()))
+    return runs / TRAINED / sha256((described + digests).encode())[:DIGITS]
+
+
+def evaluated(home: Path, evaluation: EvaluationConfig) -> Path:
+    """Return the folder of an evaluation's rows, in that of the trained configuration."""
+    return home / "evaluated" / sha256(evaluation.model_dump_json(exclude={"every"}).encode())[:DIGITS]
+
+
+def _read(path: Path, model: type[Record]) -> Record:
+    try:
+        return model.model_validate_json(read_file(path, MOST_BYTES))
+    except OSError as error:
+        raise SweepError(f"{path}: got {error.strerror}; wanted a sweep's folder, as runs/NAME") from error
+    except ValidationError as error:
+        raise SweepError(f"{path}: {explain(error)}; start the sweep again, what is trained stays") from error

@@ -1,0 +1,227 @@
+"""What a sweep is: its grid, its seeds and suites, its sizes, as ``tune_configs/*.yaml`` say it."""
+
+import itertools
+import math
+import re
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from dmil_core.configs import (
+    Count,
+    EvaluationConfig,
+    ExperimentConfig,
+    NotNegative,
+    Seed,
+    Settings,
+    SuiteConfig,
+    preset_of,
+)
+from dmil_core.seeding import stream
+from services.command_line import ConfigError, checked
+from services.results import Split
+from services.settings_files import merged
+from services.suites.registry import open_suite
+
+__all__ = ["Metric", "PlannedTrial", "Resources", "Scale", "Search", "Size", "Sweep", "planned", "row_name"]
+
+Name = Annotated[str, Field(min_length=1, max_length=60)]
+Overrides = dict[str, Any]
+"""Settings of an experiment by section, as in a file of ``--config``."""
+Metric = Literal["success_rate", "score"]
+Size = Literal["smoke", "quick", "paper"]
+
+
+class Resources(Settings):
+    """What one trial takes of the cluster, all at once or not at all."""
+
+    workers: Annotated[int, Field(ge=1, le=1000)] = 1
+    """CPUs, with an adaptation worker and then a simulation worker on each."""
+    gpus: NotNegative = 0.0
+    """GPUs of each worker, which may be less than one: as many workers share one."""
+
+
+class Scale(Settings):
+    """What a sweep does at one size: its budget."""
+
+    suites: tuple[str, ...] | None = None
+    """In place of the sweep's."""
+    seeds: tuple[Seed, ...] | None = None
+    """In place of the sweep's."""
+    settings: Overrides = Field(default_factory=dict)
+    """Beside those of the size's preset."""
+
+
+class Range(Settings):
+    """Numbers to draw from, evenly, or evenly by their logarithms."""
+
+    low: float
+    high: float
+    log: bool = False
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "Range":
+        if not (self.low < self.high and math.isfinite(self.high)) or (self.log and self.low <= 0):
+            raise ValueError(f"got low {self.low}, high {self.high}; wanted low < high, and above 0 if log")
+        return self
+
+    def draw(self, draw: np.random.Generator) -> float:
+        """Draw a number, to four digits."""
+        if self.log:
+            return float(f"{math.exp(draw.uniform(math.log(self.low), math.log(self.high))):.4g}")
+        return float(f"{draw.uniform(self.low, self.high):.4g}")
+
+
+class Search(Settings):
+    """A free search: samples of a space, the worse ones stopped early (ASHA; Li et al. 2020)."""
+
+    space: Annotated[dict[str, Range | Annotated[tuple[Any, ...], Field(min_length=1)]], Field(min_length=1)]
+    """By setting, as ``method.sub_skills``: a range, or values to choose from."""
+    samples: Count
+    seed: Seed = 0
+    """Of the samples."""
+    reduction: Annotated[int, Field(ge=2)] = 3
+    """Of so many trials that come as far as an evaluation on the way, one goes on."""
+
+    def variants(self) -> dict[str, Overrides]:
+        """Draw the samples."""
+        variants = {}
+        for number in range(self.samples):
+            settings: Overrides = {}
+            for path, values in self.space.items():
+                draw = stream(self.seed, "search", number, path)
+                value = values.draw(draw) if isinstance(values, Range) else values[int(draw.integers(len(values)))]
+                section, _, setting = path.partition(".")
+                settings.setdefault(section, {})[setting] = value
+            variants[f"sample {number}"] = settings
+        return variants
+
+
+class Sweep(Settings):
+    """A sweep, one file in ``tune_configs``."""
+
+    what: Annotated[str, Field(min_length=1, max_length=100)]
+    """In one line."""
+    paper: Literal["table4", "table5", "table6", "table7", "table8"] | None = None
+    """The paper's table with the same rows."""
+    suites: Annotated[tuple[str, ...], Field(min_length=1)]
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
+    variants: dict[Name, Overrides] = Field(default_factory=dict)
+    """The grid: what each is called in the table, and its settings."""
+    evaluations: Annotated[dict[Name, Overrides], Field(min_length=1)] | None = None
+    """Settings of evaluations that each trained checkpoint is adapted by, in place of the one."""
+    search: Search | None = None
+    """In place of variants."""
+    settings: Overrides = Field(default_factory=dict)
+    """Of all trials."""
+    shots: Annotated[tuple[Count, ...], Field(min_length=1)] = (1, 3)
+    episodes: Count = 20
+    """Of each task for each number of shots."""
+    metric: Metric = "success_rate"
+    """What the table shows, and what a search goes by."""
+    baseline: Name | None = None
+    """The row that the others are compared with; the first if none is named."""
+    rows: Literal["variants", "suites"] = "variants"
+    """What the table has in its rows; the others are in its columns."""
+    splits: tuple[Split, ...] = ("meta-training", "meta-testing")
+    """What the table shows."""
+    resources: Resources = Resources()
+    scales: dict[Size, Scale] = Field(default_factory=dict)
+    """The budget of each size, where it has one of its own."""
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> "Sweep":
+        if bool(self.variants) == bool(self.search):
+            raise ValueError("variants, search: got both or neither; wanted one of them")
+        if self.baseline is not None and self.baseline not in self.row_names:
+            raise ValueError(f"baseline: got {self.baseline!r}; wanted one of {', '.join(self.row_names)}")
+        return self
+
+    @property
+    def row_names(self) -> list[str]:
+        """What is compared: variants, evaluations, or each with each."""
+        variants = list(self.variants or (self.search.variants() if self.search else {}))
+        if self.evaluations is None:
+            return variants
+        return [row_name(variants, variant, own) for variant in variants for own in self.evaluations]
+
+
+def row_name(variants: list[str], variant: str, evaluation: str | None) -> str:
+    """Name a row of the table: where there is but one variant, by the evaluation alone."""
+    if evaluation is None:
+        return variant
+    return evaluation if len(variants) == 1 else f"{variant}, {evaluation}"
+
+
+class PlannedTrial(Settings):
+    """One configuration to train, and how to adapt and judge it."""
+
+    name: str
+    """Of its folder."""
+    variant: str
+    suite: str
+    seed: int
+    config: ExperimentConfig
+    evaluations: dict[str, EvaluationConfig]
+    """By the table's row."""
+
+
+def planned(sweep: Sweep, size: Size, suites: Sequence[str], seeds: Sequence[int]) -> list[PlannedTrial]:
+    """Return the trials of a sweep.
+
+    Args:
+        sweep: as its file says.
+        size: of the preset.
+        suites: to train on.
+        seeds: of each variant on each suite.
+
+    Raises:
+        ConfigError: for settings that there are not; names where they come from.
+        UserError: for a suite that there is not.
+    """
+    variants = sweep.search.variants() if sweep.search else sweep.variants
+    evaluation: Overrides = {"shots": list(sweep.shots)} | ({} if size == "smoke" else {"episodes": sweep.episodes})
+    layers = {"shots, episodes": {"evaluation": evaluation}, "settings": sweep.settings}
+    if scale := sweep.scales.get(size):
+        layers[f"scales.{size}.settings"] = scale.settings
+    trials = []
+    for suite, (variant, own), seed in itertools.product(suites, variants.items(), seeds):
+        settings = preset_of(suite, size).model_dump()
+        for origin, overrides in {**layers, f"variants.{variant}": own, "seeds": {"seed": seed}}.items():
+            settings = merged(settings, overrides, origin)
+        config = checked(settings, f"{variant} on {suite}: ")
+        evaluations = {
+            row_name(list(variants), variant, name): checked(
+                merged(settings, {"evaluation": changes}, f"evaluations.{name}"), f"evaluations.{name}: "
+            ).evaluation
+            for name, changes in (sweep.evaluations or {None: {}}).items()
+        }
+        name = re.sub(r"[^\w.=-]+", "-", f"{suite}-{variant}-seed-{seed}", flags=re.ASCII)
+        trials.append(
+            PlannedTrial(name=name, variant=variant, suite=suite, seed=seed, config=config, evaluations=evaluations)
+        )
+    if sweep.search:
+        for suite in {trial.config.suite for trial in trials}:
+            _only_training_tasks(suite)
+        if any(trial.config.evaluation.every is None for trial in trials):
+            raise ConfigError("settings.evaluation.every: got none; wanted iterations between what a search goes by")
+    return trials
+
+
+def _only_training_tasks(suite: SuiteConfig) -> None:
+    """Refuse a search that would choose by tasks of meta-testing.
+
+    Raises:
+        ConfigError: names them.
+    """
+    whole = open_suite(suite.model_copy(update={"train_tasks": None, "test_tasks": None}))
+    held_out = suite.test_tasks or whole.test_tasks
+    if wrong := set(held_out) - set(whole.train_tasks):
+        raise ConfigError(
+            f"settings.suite.test_tasks: got {', '.join(sorted(wrong))}; wanted some of {suite.name}'s own "
+            "meta-training tasks, held out: a search must not look at meta-testing tasks"
+        )
+    if both := set(held_out) & set(suite.train_tasks or whole.train_tasks):
+        raise ConfigError(f"settings.suite.train_tasks: got {', '.join(sorted(both))}; wanted those not in test_tasks")

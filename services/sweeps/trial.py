@@ -1,0 +1,174 @@
+"""One trial of a sweep, in the process that Tune gives it: the same experiment as ``meta_train``."""
+
+import os
+import time
+from collections.abc import Mapping
+from contextlib import redirect_stdout
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from filelock import FileLock
+from pydantic import TypeAdapter
+
+from dmil_core.errors import RunError, UserError
+from services.checkpoints import Checkpoint, Checkpoints
+from services.command_line import with_evaluation
+from services.demo_store import DemoStore
+from services.disk import read_file, write_file
+from services.experiment import Experiment
+from services.progress import Clock, console
+from services.ray_runner import RayRunner
+from services.report import read_metrics
+from services.results import EpisodeResult, read_rows
+from services.summary import cells, rates
+from services.sweeps.folders import SweepFolder, TrialResult, evaluated, trained
+from services.sweeps.settings import PlannedTrial
+from services.tracking import Tracker, introduce
+
+__all__ = ["HELD_OUT", "run_trial", "tracker_of"]
+
+HELD_OUT, ITERATION = "held_out", "iteration"
+"""What a trial reports to Tune."""
+REPORT_SECONDS = 2.0
+MOST_BYTES = 2**28
+_METRICS = TypeAdapter(list[dict[str, float]])
+
+
+class ReportingTracker(Tracker):
+    """Tells Tune too how far the trial is, and what a search goes by."""
+
+    goes_by: str
+    _last = 0.0
+
+    def metrics(self, step: int, values: Mapping[str, float], *, anew: bool = False) -> None:
+        """Record metrics of one iteration."""
+        from ray import tune
+
+        super().metrics(step, values, anew=anew)
+        held_out = [value for name, value in values.items() if name.startswith(self.goes_by)]
+        if held_out:
+            tune.report({ITERATION: step, HELD_OUT: float(np.mean(held_out))})
+        elif time.monotonic() - self._last > REPORT_SECONDS:
+            self._last = time.monotonic()
+            tune.report({ITERATION: step})
+
+
+def tracker_of(sweep: SweepFolder, trial: PlannedTrial, kind: type[Tracker] = Tracker) -> Tracker:
+    """Return what records a trial as a child of the sweep's MLflow run."""
+    folder = sweep.of_trial(trial.name)
+    folder.mkdir(parents=True, exist_ok=True)
+    say = partial(console.print, markup=False)
+    return kind(folder, f"dmil-{sweep.record.name}", say, parent=sweep.path)
+
+
+def run_trial(folder: Path, name: str, demonstrations: Path, mlflow: str) -> None:
+    """Run a trial to its end, or from where it was stopped, and note what came of it.
+
+    An error in it is noted and tracked, and is no failure to Tune, which would only try again. If the process dies,
+    Tune starts it again.
+
+    Args:
+        folder: of the sweep.
+        name: of the trial.
+        demonstrations: root of their store.
+        mlflow: address of MLflow.
+    """
+    torch.set_num_threads(1)
+    os.environ["MLFLOW_TRACKING_URI"] = mlflow
+    sweep = SweepFolder(folder)
+    trial = sweep.trials[name]
+    tracker = tracker_of(sweep, trial, ReportingTracker)
+    assert isinstance(tracker, ReportingTracker)
+    tracker.goes_by = f"{sweep.record.sweep.metric}/meta-testing/"
+    status = "KILLED"
+    with (sweep.of_trial(name) / "log.txt").open("a", buffering=1) as log, redirect_stdout(log):
+        try:
+            introduce(tracker, trial.config)
+            tracker.tags({"sweep": sweep.record.name, "variant": trial.variant, "scale": sweep.record.size})
+            sweep.finish(name, _run(sweep, trial, DemoStore(demonstrations), tracker))
+            status = "FINISHED"
+        except Exception as error:  # noqa: BLE001  whatever it is, it is shown, and the other trials go on
+            status = "FAILED"
+            told = str(error) if isinstance(error, UserError | RunError) else f"{type(error).__name__}: {error}"
+            console.print(f"error: {told}", markup=False)
+            tracker.tags({"error": told[:5000]})
+            sweep.finish(name, TrialResult(status="failed", error=told))
+        finally:
+            tracker.close(status)
+
+
+def _run(sweep: SweepFolder, trial: PlannedTrial, store: DemoStore, tracker: Tracker) -> TrialResult:
+    config, resources, clock = trial.config, sweep.record.sweep.resources, Clock()
+    experiment = Experiment(config, store)
+    runner = RayRunner(experiment.suite, resources.workers, resources.gpus)
+    try:
+        clock.lap("start")
+        data = experiment.collect(runner)
+        digests = {task: dataset.digest for task, dataset in data.items()}
+        tracker.inputs({dataset.id: dataset.digest for dataset in data.values()})
+        home = trained(sweep.runs, config, digests)
+        home.mkdir(parents=True, exist_ok=True)
+        tracker.tags({"trained": home.name})
+        clock.lap("collect")
+        with FileLock(home / ".lock"):  # two sweeps may want it
+            checkpoints = Checkpoints(home / "checkpoints", config.training.checkpoints_kept)
+            checkpoint = _whole(checkpoints, config.training.iterations)
+            if checkpoint is None:
+                write_file(home / "config.json", config.model_dump_json(indent=1) + "\n")
+                newest = checkpoints.newest() if checkpoints.all() else None
+                checkpoint = experiment.train(runner, data, checkpoints, tracker, newest, overlap_evaluation=False)
+                curves = read_metrics(sweep.of_trial(trial.name))
+                write_file(home / "metrics.json", _METRICS.dump_json(curves))
+            else:
+                console.print(f"trained already: {home}")
+                _copy_curves(home / "metrics.json", tracker)
+            clock.lap("train")
+            folders = {}
+            for row, evaluation in trial.evaluations.items():
+                own = Experiment(with_evaluation(config, evaluation), store)
+                folders[row] = evaluated(home, evaluation)
+                if not (folders[row] / "episodes.jsonl").exists():
+                    folders[row].mkdir(parents=True, exist_ok=True)
+                    own.evaluate(runner, data, checkpoint, folders[row])
+            clock.lap("evaluate")
+    finally:
+        runner.close()
+    held_out = [
+        _record(tracker, folder, row if len(folders) > 1 else "", experiment, checkpoint, sweep.record.sweep.metric)
+        for row, folder in folders.items()
+    ]
+    return TrialResult(
+        status="finished",
+        trained=str(home.relative_to(sweep.runs)),
+        evaluated={row: str(folder.relative_to(sweep.runs)) for row, folder in folders.items()},
+        seconds=clock.seconds,
+        iteration=checkpoint.manifest.iteration,
+        held_out=float(np.mean(held_out)),
+    )
+
+
+def _whole(checkpoints: Checkpoints, iterations: int) -> Checkpoint | None:
+    """Return the last checkpoint of a training that came to its end."""
+    newest = checkpoints.newest() if checkpoints.all() else None
+    return newest if newest is not None and newest.manifest.iteration >= iterations else None
+
+
+def _copy_curves(metrics: Path, tracker: Tracker) -> None:
+    """Record what another trial recorded when it trained."""
+    if metrics.exists():
+        for row in _METRICS.validate_json(read_file(metrics, MOST_BYTES)):
+            iteration = int(row.pop("iteration"))
+            tracker.metrics(iteration, row)
+
+
+def _record(
+    tracker: Tracker, folder: Path, prefix: str, experiment: Experiment, checkpoint: Checkpoint, metric: str
+) -> float:
+    """Record the rates of an evaluation, and return what a search would go by."""
+    rows = read_rows(folder / "episodes.jsonl", EpisodeResult)
+    found = rates(cells(rows, experiment.suite.best_score, experiment.config.method.sub_skills), {})
+    iteration = checkpoint.manifest.iteration
+    tracker.metrics(iteration, {f"{prefix}/{name}" if prefix else name: value for name, value in found.items()})
+    return float(np.mean([value for name, value in found.items() if name.startswith(f"{metric}/meta-testing/")]))

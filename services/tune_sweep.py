@@ -1,0 +1,177 @@
+"""Run one of the paper's ablations, or a search of one's own, on Ray Tune, and lay its table beside the paper's.
+
+What is trained once, by this sweep or another, is not trained again.
+"""
+
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from pydantic import ValidationError
+
+from dmil_core.errors import RunError, explain
+from services.cluster import joined
+from services.command_line import ConfigError, exit_code, parse
+from services.demo_store import DemoStore, data_root
+from services.experiment import Experiment
+from services.folders import find_folder, new_folder
+from services.progress import Clock, console
+from services.provenance import git_commit, library_versions
+from services.ray_runner import RayRunner
+from services.settings_files import read_yaml
+from services.sweeps.folders import MARK, SweepFolder, SweepRecord
+from services.sweeps.settings import Size, Sweep, planned
+from services.sweeps.tables import publish, show, write_tables
+from services.tracking import Tracker
+
+__all__ = ["Arguments", "run"]
+
+CONFIGS = Path(__file__).parents[1] / "tune_configs"
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Arguments of ``tune_sweep``."""
+
+    sweep: Annotated[str | None, tyro.conf.Positional] = None
+    """File of the sweep, or the name of one in tune_configs."""
+    scale: Size = "quick"
+    """Size of every training: smoke (to see that all works), quick (some minutes each on one core), paper."""
+    suites: tuple[str, ...] | None = None
+    """Suites in place of the sweep's."""
+    seeds: tuple[int, ...] | None = None
+    """Seeds in place of the sweep's."""
+    runs: Path = Path("runs")
+    """The folder that the sweep's own folder is made in, and where trained configurations are looked for."""
+    name: str | None = None
+    """Name of the sweep's folder; that of its file and the scale with the time if not given."""
+    resume: str | None = None
+    """Name or folder of a sweep to go on with: what is finished stays, what failed or was cut off goes on."""
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run the program."""
+    given = parse(Arguments, _description(), arguments, Arguments())
+    sweep = _resumed(given) if given.resume is not None else _begun(given)
+    clock = Clock()
+    console.print(f"sweep: {sweep.path}")
+    tracker = Tracker(sweep.path, f"dmil-{sweep.record.name}", partial(console.print, markup=False))
+    status = "FAILED"
+    try:
+        _introduce(tracker, sweep)
+        with joined():
+            clock.lap("start")
+            _collect(sweep)
+            clock.lap("collect")
+            tracker.identify()  # trials are its children
+            from services.sweeps.tuning import tune_trials  # takes seconds to import: not for --help
+
+            tune_trials(sweep)
+            clock.lap("trials")
+        tables = write_tables(sweep)
+        publish(tracker, tables, sweep)
+        status = "FINISHED"
+    except KeyboardInterrupt:
+        status = "KILLED"
+        console.print(f"stopped; to go on: python -m services.tune_sweep --resume {sweep.path}")
+        raise
+    finally:
+        tracker.close(status)
+    show(tables, sweep)
+    console.print("seconds: " + ", ".join(f"{phase} {spent:.0f}" for phase, spent in clock.seconds.items()))
+    console.print(f"MLflow run: {tracker.run_id or 'not there yet'} at {tracker.uri}")
+    if failed := [name for name in sweep.trials if (result := sweep.result(name)) and result.status == "failed"]:
+        raise RunError(
+            f"{len(failed)} of {len(sweep.trials)} trials failed, see above; the others are in the table; to try them "
+            f"again: python -m services.tune_sweep --resume {sweep.path}"
+        )
+
+
+def _description() -> str:
+    lines = []
+    for file in sorted(CONFIGS.glob("*.yaml")):
+        try:
+            lines.append(f"  {file.stem:16}{_read(file).what}")
+        except ConfigError as error:
+            lines.append(f"  {file.stem:16}cannot be read: {error}")
+    return (__doc__ or "") + "\n".join(["\nSweeps in tune_configs:", "", *lines])
+
+
+def _read(file: Path) -> Sweep:
+    try:
+        return Sweep.model_validate(read_yaml(file, "SWEEP"))
+    except ValidationError as error:
+        raise ConfigError("\n".join(f"{file}: {line}" for line in explain(error).splitlines())) from error
+
+
+def _begun(given: Arguments) -> SweepFolder:
+    """Make the folder of a new sweep."""
+    known = [file.stem for file in sorted(CONFIGS.glob("*.yaml"))]
+    if given.sweep is None:
+        raise ConfigError(f"SWEEP: got none; wanted a file as tune_configs/em.yaml, or one of {', '.join(known)}")
+    file = CONFIGS / f"{given.sweep}.yaml" if given.sweep in known else Path(given.sweep)
+    sweep = _read(file)
+    scale = sweep.scales.get(given.scale)
+    suites = given.suites or (scale and scale.suites) or sweep.suites
+    seeds = given.seeds or (scale and scale.seeds) or sweep.seeds
+    for value, flag in ((suites, "--suites"), (seeds, "--seeds")):
+        if len(set(value)) < len(value):
+            raise ConfigError(f"{flag}: got {' '.join(map(str, value))}; wanted each once")
+    planned(sweep, given.scale, suites, seeds)
+    name = given.name or f"{file.stem}-{given.scale}-{datetime.now():%Y%m%d-%H%M%S}"
+    folder = new_folder(name, given.runs, MARK)
+    record = SweepRecord(
+        name=file.stem,
+        size=given.scale,
+        suites=suites,
+        seeds=seeds,
+        sweep=sweep,
+        began=datetime.now(UTC),
+        command=shlex.join(["python", "-m", "services.tune_sweep", *sys.argv[1:]]),
+        commit=git_commit(),
+        versions=library_versions(),
+    )
+    return SweepFolder.make(folder, record)
+
+
+def _resumed(given: Arguments) -> SweepFolder:
+    """Open the folder of a sweep that was begun."""
+    if given.sweep or given.suites or given.seeds or given.name:
+        raise ConfigError(
+            "--resume: got SWEEP, --suites, --seeds or --name with it; wanted none: a sweep goes on with its own"
+        )
+    assert given.resume is not None
+    return SweepFolder(find_folder(given.resume, given.runs, MARK))
+
+
+def _introduce(tracker: Tracker, sweep: SweepFolder) -> None:
+    record = sweep.record
+    tracker.parameters(
+        {"sweep": record.name, "scale": record.size, "suites": " ".join(record.suites), "trials": len(sweep.trials)}
+        | {"seeds": " ".join(map(str, record.seeds)), "rows": ", ".join(record.sweep.row_names)}
+    )
+    tracker.tags({"sweep": record.name, "scale": record.size, "git_commit": record.commit, "command": record.command})
+    tracker.tags({"suite": " ".join(record.suites), "method": "dmil", "seed": " ".join(map(str, record.seeds))})
+
+
+def _collect(sweep: SweepFolder) -> None:
+    """Have all demonstrations there before the first trial, made on all CPUs."""
+    store = DemoStore(data_root())
+    configs = {(trial.config.suite, trial.config.demonstrations): trial.config for trial in sweep.trials.values()}
+    for config in configs.values():
+        experiment = Experiment(config, store)
+        runner = RayRunner(experiment.suite, None)
+        try:
+            experiment.collect(runner)
+        finally:
+            runner.close()
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(run, sys.argv[1:]))
