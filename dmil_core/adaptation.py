@@ -28,11 +28,12 @@ __all__ = [
     "act",
     "adapt",
     "choose",
+    "errors_of",
     "high_level_slope",
     "inner_loop",
     "label",
-    "outer_targets",
     "sub_skill_slopes",
+    "targets_of",
 ]
 
 
@@ -77,25 +78,25 @@ class Adapted(NamedTuple):
     low_losses: tuple[float, ...]
 
 
-def label(low: Sequence[Network], steps: Steps) -> Int[Tensor, " steps"]:
-    """Return for each step the sub-skill that explains its action best, the target of equation 3."""
-    return sub_skill_labels(torch.stack([_errors(sub_skill, steps) for sub_skill in low]))
-
-
-def outer_targets(low: Sequence[Network], steps: Steps, config: DmilConfig) -> Targets:
-    """Return what the high level should predict in the outer loop, where the reference's labels are hard."""
-    errors = torch.stack([_errors(sub_skill, steps) for sub_skill in low])
-    return soft_labels(errors, config.posterior_deviation) if config.em == "soft" else sub_skill_labels(errors)
-
-
-def _inner_targets(errors: list[Float[Tensor, " steps"]], config: DmilConfig) -> Targets:
-    if config.em == "hard":
-        return sub_skill_labels(torch.stack(errors))
-    return soft_labels(torch.stack(errors), config.posterior_deviation, transposed=config.em == "soft")
+def errors_of(low: Sequence[Network], steps: Steps) -> Float[Tensor, "sub_skills steps"]:
+    """Return ‖π_k(s_t) − a_t‖² of every sub-skill at every step."""
+    return torch.stack([_errors(sub_skill, steps) for sub_skill in low])
 
 
 def _errors(sub_skill: Network, steps: Steps) -> Float[Tensor, " steps"]:
     return squared_errors(mlp(sub_skill, steps.states), steps.actions)
+
+
+def label(low: Sequence[Network], steps: Steps) -> Int[Tensor, " steps"]:
+    """Return for each step the sub-skill that explains its action best, the target of equation 3."""
+    return sub_skill_labels(errors_of(low, steps))
+
+
+def targets_of(errors: Float[Tensor, "sub_skills steps"], config: DmilConfig, *, inner: bool) -> Targets:
+    """Return what the high level should predict; in the outer loop, the reference's labels are hard."""
+    if config.em == "hard" or (config.em == "reference_soft" and not inner):
+        return sub_skill_labels(errors)
+    return soft_labels(errors, config.posterior_deviation, transposed=config.em == "soft")
 
 
 def choose(high: Network, states: Float[Tensor, "steps obs_dim"]) -> Int[Tensor, " steps"]:
@@ -158,7 +159,7 @@ def inner_loop(
 
     errors = [_errors(sub_skill, support_high) for sub_skill in low]
     while True:
-        of_high = high_level_slope(high, support_high, _inner_targets(errors, config), config)
+        of_high = high_level_slope(high, support_high, targets_of(torch.stack(errors), config, inner=True), config)
         if config.adapted != "low":
             high = descend(of_high, hierarchy.high)
         of_low = sub_skill_slopes(low, support_low, choose(high, support_low.states))

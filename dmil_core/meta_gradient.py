@@ -8,9 +8,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dmil_core.adaptation import Hierarchy, choose, high_level_slope, inner_loop, label, outer_targets, sub_skill_slopes
+from dmil_core.adaptation import (
+    Hierarchy,
+    choose,
+    errors_of,
+    high_level_slope,
+    inner_loop,
+    sub_skill_slopes,
+    targets_of,
+)
 from dmil_core.configs import DmilConfig
-from dmil_core.losses import Steps, continuity_loss
+from dmil_core.losses import Steps, continuity_loss, sub_skill_labels
 from dmil_core.networks import Parameters, unflatten
 from dmil_core.slopes import Slope
 
@@ -44,7 +52,8 @@ def task_gradient(
     path = list(itertools.islice(loop, config.inner_steps))
     high, low = path[-1].adapted
 
-    of_high = high_level_slope(high, query_high, outer_targets(low, query_high, config), config)
+    errors = errors_of(low, query_high)
+    of_high = high_level_slope(high, query_high, targets_of(errors, config, inner=False), config)
     chosen = choose(high, query_low.states)
     of_low = sub_skill_slopes(low, query_low, chosen)
 
@@ -69,7 +78,7 @@ def task_gradient(
         "low_loss_before": _total(path[0].low),
         "low_loss_after": _total(of_low),
         "continuity_loss": continuity_loss(probabilities, query_high.lengths).item(),
-        "agreement": (probabilities.argmax(-1) == label(low, query_high)).float().mean().item(),
+        "agreement": (probabilities.argmax(-1) == sub_skill_labels(errors)).float().mean().item(),
         **{f"sub_skill_share/{k}": share for k, share in enumerate(shares.tolist())},
     }
     return TaskGradient(gradient, metrics)
