@@ -116,21 +116,16 @@ def _begun(given: Arguments) -> SweepFolder:
     if given.sweep is None:
         raise ConfigError(f"SWEEP: got none; wanted a file as tune_configs/em.yaml, or one of {', '.join(known)}")
     file = CONFIGS / f"{given.sweep}.yaml" if given.sweep in known else Path(given.sweep)
-    sweep = _read(file)
-    scale = sweep.scales.get(given.scale)
-    suites = given.suites or (scale and scale.suites) or sweep.suites
-    seeds = given.seeds or (scale and scale.seeds) or sweep.seeds
-    for value, flag in ((suites, "--suites"), (seeds, "--seeds")):
+    sweep = _read(file).at(given.scale, given.suites or (), given.seeds or ())
+    for value, flag in ((sweep.suites, "--suites"), (sweep.seeds, "--seeds")):
         if len(set(value)) < len(value):
             raise ConfigError(f"{flag}: got {' '.join(map(str, value))}; wanted each once")
-    planned(sweep, given.scale, suites, seeds)
+    planned(sweep, given.scale)
     name = given.name or f"{file.stem}-{given.scale}-{datetime.now():%Y%m%d-%H%M%S}"
     folder = new_folder(name, given.runs, MARK)
     record = SweepRecord(
         name=file.stem,
         size=given.scale,
-        suites=suites,
-        seeds=seeds,
         sweep=sweep,
         began=datetime.now(UTC),
         command=shlex.join(["python", "-m", "services.tune_sweep", *sys.argv[1:]]),
@@ -151,13 +146,12 @@ def _resumed(given: Arguments) -> SweepFolder:
 
 
 def _introduce(tracker: Tracker, sweep: SweepFolder) -> None:
-    record = sweep.record
-    tracker.parameters(
-        {"sweep": record.name, "scale": record.size, "suites": " ".join(record.suites), "trials": len(sweep.trials)}
-        | {"seeds": " ".join(map(str, record.seeds)), "rows": ", ".join(record.sweep.row_names)}
-    )
-    tracker.tags({"sweep": record.name, "scale": record.size, "git_commit": record.commit, "command": record.command})
-    tracker.tags({"suite": " ".join(record.suites), "method": "dmil", "seed": " ".join(map(str, record.seeds))})
+    record, settings = sweep.record, sweep.record.sweep
+    suites, seeds = " ".join(settings.suites), " ".join(map(str, settings.seeds))
+    tracker.parameters({"sweep": record.name, "scale": record.size, "suites": suites, "seeds": seeds})
+    tracker.parameters({"rows": ", ".join(settings.row_names), "trials": len(sweep.trials)})
+    tracker.tags({"sweep": record.name, "scale": record.size, "suite": suites, "method": "dmil", "seed": seeds})
+    tracker.tags({"git_commit": record.commit, "command": record.command})
 
 
 def _collect(sweep: SweepFolder) -> None:

@@ -47,9 +47,8 @@ class SweepRecord(_Record):
     name: str
     """Of the file."""
     size: Size
-    suites: tuple[str, ...]
-    seeds: tuple[int, ...]
     sweep: Sweep
+    """As it is at this size."""
     began: datetime
     command: str
     commit: str
@@ -94,8 +93,7 @@ class SweepFolder:
     @cached_property
     def trials(self) -> dict[str, PlannedTrial]:
         """All trials by name."""
-        record = self.record
-        return {trial.name: trial for trial in planned(record.sweep, record.size, record.suites, record.seeds)}
+        return {trial.name: trial for trial in planned(self.record.sweep, self.record.size)}
 
     def of_trial(self, name: str) -> Path:
         """Return the folder of a trial, which may not be there yet."""

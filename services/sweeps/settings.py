@@ -50,8 +50,10 @@ class Scale(Settings):
     """In place of the sweep's."""
     seeds: tuple[Seed, ...] | None = None
     """In place of the sweep's."""
+    samples: Count | None = None
+    """In place of the search's."""
     settings: Overrides = Field(default_factory=dict)
-    """Beside those of the size's preset."""
+    """Beside the sweep's."""
 
 
 class Range(Settings):
@@ -139,6 +141,19 @@ class Sweep(Settings):
             raise ValueError(f"baseline: got {self.baseline!r}; wanted one of {', '.join(self.row_names)}")
         return self
 
+    def at(self, size: Size, suites: Sequence[str] = (), seeds: Sequence[int] = ()) -> "Sweep":
+        """Return the sweep as it is at one size, with other suites and seeds if they are given."""
+        scale = self.scales.get(size, Scale())
+        changes: dict[str, Any] = {
+            "suites": tuple(suites) or scale.suites or self.suites,
+            "seeds": tuple(seeds) or scale.seeds or self.seeds,
+            "settings": _laid_over(self.settings, scale.settings),
+            "scales": {},
+        }
+        if self.search is not None:
+            changes["search"] = self.search.model_copy(update={"samples": scale.samples or self.search.samples})
+        return self.model_copy(update=changes)
+
     @property
     def row_names(self) -> list[str]:
         """What is compared: variants, evaluations, or each with each."""
@@ -146,6 +161,11 @@ class Sweep(Settings):
         if self.evaluations is None:
             return variants
         return [row_name(variants, variant, own) for variant in variants for own in self.evaluations]
+
+
+def _laid_over(settings: Overrides, others: Overrides) -> Overrides:
+    """Return some settings with others over them, section by section."""
+    return {section: {**settings.get(section, {}), **others.get(section, {})} for section in (*settings, *others)}
 
 
 def row_name(variants: list[str], variant: str, evaluation: str | None) -> str:
@@ -168,14 +188,12 @@ class PlannedTrial(Settings):
     """By the table's row."""
 
 
-def planned(sweep: Sweep, size: Size, suites: Sequence[str], seeds: Sequence[int]) -> list[PlannedTrial]:
+def planned(sweep: Sweep, size: Size) -> list[PlannedTrial]:
     """Return the trials of a sweep.
 
     Args:
-        sweep: as its file says.
+        sweep: as it is at this size.
         size: of the preset.
-        suites: to train on.
-        seeds: of each variant on each suite.
 
     Raises:
         ConfigError: for settings that there are not; names where they come from.
@@ -184,10 +202,8 @@ def planned(sweep: Sweep, size: Size, suites: Sequence[str], seeds: Sequence[int
     variants = sweep.search.variants() if sweep.search else sweep.variants
     evaluation: Overrides = {"shots": list(sweep.shots)} | ({} if size == "smoke" else {"episodes": sweep.episodes})
     layers = {"shots, episodes": {"evaluation": evaluation}, "settings": sweep.settings}
-    if scale := sweep.scales.get(size):
-        layers[f"scales.{size}.settings"] = scale.settings
     trials = []
-    for suite, (variant, own), seed in itertools.product(suites, variants.items(), seeds):
+    for suite, (variant, own), seed in itertools.product(sweep.suites, variants.items(), sweep.seeds):
         settings = preset_of(suite, size).model_dump()
         for origin, overrides in {**layers, f"variants.{variant}": own, "seeds": {"seed": seed}}.items():
             settings = merged(settings, overrides, origin)

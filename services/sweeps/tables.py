@@ -225,7 +225,7 @@ def tables_of(sweep: SweepFolder) -> Tables:
     places = [
         Place(row, suite, split, shots)
         for row in rows
-        for suite, split, shots in itertools.product(record.suites, settings.splits, settings.shots)
+        for suite, split, shots in itertools.product(settings.suites, settings.splits, settings.shots)
     ]
     differences = [
         difference(place, baseline, outcomes[place], outcomes[place._replace(row=baseline)])
@@ -244,7 +244,7 @@ def tables_of(sweep: SweepFolder) -> Tables:
         commit=record.commit,
         command=record.command,
         by=settings.rows,
-        rows=list(record.suites) if settings.rows == "suites" else rows,
+        rows=list(settings.suites) if settings.rows == "suites" else rows,
         columns=list(dict.fromkeys(_column(place, settings.rows) for place in places)),
         cells=[cell(place, outcomes[place], settings.paper, settings.metric) for place in places if place in outcomes],
         differences=[found for found in differences if found is not None] if not settings.search else [],
