@@ -12,6 +12,7 @@ __all__ = [
     "EvaluationConfig",
     "ExperimentConfig",
     "SuiteConfig",
+    "SuiteName",
     "TrainingConfig",
     "preset_of",
 ]
@@ -22,6 +23,7 @@ Size = Annotated[int, Field(ge=1, le=10_000)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+SuiteName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]*$")]
 
 
 class Settings(BaseModel):
@@ -33,7 +35,7 @@ class Settings(BaseModel):
 class SuiteConfig(Settings):
     """Which tasks there are, and when an episode counts as a success."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]*$")] = "ml10"
+    name: SuiteName = "ml10"
     """ml10 and ml45: Meta-World's own splits; ml10-reference: the one of the authors' released code; ML1-reach and the
     like: one task; push-around-wall: the paper's new task after ml10's meta-training tasks (Figure 8);
     kitchen-topburner, -microwave, -kettle and -slide: the Franka kitchen without that sub-task in meta-training

@@ -25,6 +25,7 @@ from services.progress import Clock, console
 from services.provenance import git_commit, library_versions
 from services.ray_runner import RayRunner
 from services.settings_files import read_yaml
+from services.suites.registry import open_suite
 from services.sweeps.folders import MARK, SweepFolder, SweepRecord
 from services.sweeps.settings import Size, Sweep, planned
 from services.sweeps.tables import publish, show, write_tables
@@ -116,11 +117,15 @@ def _begun(given: Arguments) -> SweepFolder:
     if given.sweep is None:
         raise ConfigError(f"SWEEP: got none; wanted a file as tune_configs/em.yaml, or one of {', '.join(known)}")
     file = CONFIGS / f"{given.sweep}.yaml" if given.sweep in known else Path(given.sweep)
-    sweep = _read(file).at(given.scale, given.suites or (), given.seeds or ())
+    try:
+        sweep = _read(file).at(given.scale, given.suites or (), given.seeds or ())
+    except ValidationError as error:
+        raise ConfigError("\n".join(f"--{line}" for line in explain(error).splitlines())) from error
     for value, flag in ((sweep.suites, "--suites"), (sweep.seeds, "--seeds")):
         if len(set(value)) < len(value):
             raise ConfigError(f"{flag}: got {' '.join(map(str, value))}; wanted each once")
-    planned(sweep, given.scale)
+    for trial in planned(sweep, given.scale):
+        open_suite(trial.config.suite)
     name = given.name or f"{file.stem}-{given.scale}-{datetime.now():%Y%m%d-%H%M%S}"
     folder = new_folder(name, given.runs, MARK)
     record = SweepRecord(

@@ -17,6 +17,7 @@ from dmil_core.configs import (
     Seed,
     Settings,
     SuiteConfig,
+    SuiteName,
     preset_of,
 )
 from dmil_core.seeding import stream
@@ -46,7 +47,7 @@ class Resources(Settings):
 class Scale(Settings):
     """What a sweep does at one size: its budget."""
 
-    suites: tuple[str, ...] | None = None
+    suites: tuple[SuiteName, ...] | None = None
     """In place of the sweep's."""
     seeds: tuple[Seed, ...] | None = None
     """In place of the sweep's."""
@@ -108,7 +109,7 @@ class Sweep(Settings):
     """In one line."""
     paper: Literal["table4", "table5", "table6", "table7", "table8"] | None = None
     """The paper's table with the same rows."""
-    suites: Annotated[tuple[str, ...], Field(min_length=1)]
+    suites: Annotated[tuple[SuiteName, ...], Field(min_length=1)]
     seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
     variants: dict[Name, Overrides] = Field(default_factory=dict)
     """The grid: what each is called in the table, and its settings."""
@@ -142,7 +143,11 @@ class Sweep(Settings):
         return self
 
     def at(self, size: Size, suites: Sequence[str] = (), seeds: Sequence[int] = ()) -> "Sweep":
-        """Return the sweep as it is at one size, with other suites and seeds if they are given."""
+        """Return the sweep as it is at one size, with other suites and seeds if they are given.
+
+        Raises:
+            ValidationError: for a name that no suite can have, or a seed that is none.
+        """
         scale = self.scales.get(size, Scale())
         changes: dict[str, Any] = {
             "suites": tuple(suites) or scale.suites or self.suites,
@@ -151,8 +156,8 @@ class Sweep(Settings):
             "scales": {},
         }
         if self.search is not None:
-            changes["search"] = self.search.model_copy(update={"samples": scale.samples or self.search.samples})
-        return self.model_copy(update=changes)
+            changes["search"] = {**self.search.model_dump(), "samples": scale.samples or self.search.samples}
+        return Sweep.model_validate({**self.model_dump(), **changes})
 
     @property
     def row_names(self) -> list[str]:

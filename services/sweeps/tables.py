@@ -28,7 +28,8 @@ from services.disk import write_file
 from services.folders import find_folder
 from services.progress import console
 from services.published import Published, figure
-from services.results import EpisodeResult, Split, read_rows
+from services.results import AdaptationResult, EpisodeResult, Split, read_rows
+from services.summary import sub_skill_use
 from services.sweeps.folders import MARK, SweepError, SweepFolder
 from services.sweeps.settings import Metric
 from services.tracking import Tracker
@@ -73,6 +74,8 @@ class Cell(BaseModel):
     interquartile_mean: float
     """Over the rates of each task and seed."""
     interval: Literal["bootstrap over seeds and episodes", "Wilson", "Student"]
+    sub_skills_in_use: float
+    """Those with over a tenth of a task's states after adaptation, on average over adaptations."""
     paper: Published | None
     difference: float | None
     """From the paper's figure."""
@@ -155,11 +158,31 @@ def outcomes_of(sweep: SweepFolder) -> dict[Place, Outcomes]:
                         episode.success if metric == "success_rate" else episode.score
                     )
                 table = [[own[number] for number in sorted(own)] for _, own in sorted(by_task.items())]
+                if len({len(own) for own in table}) > 1:
+                    raise _other_episodes(sweep, row)
                 found[Place(row, trial.suite, split, shots)][trial.seed] = np.array(table)
     for place, seeds in found.items():
-        if len({outcomes.shape for outcomes in seeds.values()}) > 1 or any(o.ndim != 2 for o in seeds.values()):
-            raise SweepError(f"{sweep.path}: got other episodes for each seed of {place.row}; start the sweep again")
+        if len({outcomes.shape for outcomes in seeds.values()}) > 1:
+            raise _other_episodes(sweep, place.row)
     return dict(found)
+
+
+def _other_episodes(sweep: SweepFolder, row: str) -> SweepError:
+    return SweepError(
+        f"{sweep.path}: got rows of {row} with not as many episodes of each task and seed; remove its folders named in "
+        "trials/*/result.json, and start the sweep again"
+    )
+
+
+def _in_use(sweep: SweepFolder) -> dict[Place, float]:
+    """Return how many sub-skills are in use per task in all finished trials."""
+    found: dict[Place, list[AdaptationResult]] = defaultdict(list)
+    for name, trial in sweep.trials.items():
+        result = sweep.result(name)
+        for row, folder in (result.evaluated if result else {}).items():
+            for adaptation in read_rows(sweep.runs / folder / "adaptations.jsonl", AdaptationResult):
+                found[Place(row, trial.suite, adaptation.split, adaptation.shots)].append(adaptation)
+    return {place: sub_skill_use(rows)[place.split].in_use_per_task for place, rows in found.items()}
 
 
 def _grouped(rows: Iterable[EpisodeResult]) -> dict[tuple[Split, int], list[EpisodeResult]]:
@@ -169,7 +192,7 @@ def _grouped(rows: Iterable[EpisodeResult]) -> dict[tuple[Split, int], list[Epis
     return groups
 
 
-def cell(place: Place, outcomes: Outcomes, table: str | None, metric: Metric) -> Cell:
+def cell(place: Place, outcomes: Outcomes, in_use: float, table: str | None, metric: Metric) -> Cell:
     """Return the mean of some outcomes with its interval, and the paper's figure."""
     seeds = sorted(outcomes)
     values = np.stack([outcomes[seed] for seed in seeds])
@@ -198,6 +221,7 @@ def cell(place: Place, outcomes: Outcomes, table: str | None, metric: Metric) ->
         high=high,
         interquartile_mean=interquartile_mean(values.mean(2).ravel().tolist()),
         interval=kind,
+        sub_skills_in_use=in_use,
         paper=paper,
         difference=None if paper is None else mean - paper.value,
         outside=outside,
@@ -232,7 +256,7 @@ def tables_of(sweep: SweepFolder) -> Tables:
         for place in places
         if place.row != baseline and place in outcomes and place._replace(row=baseline) in outcomes
     ]
-    results = {name: sweep.result(name) for name in sweep.trials}
+    in_use, results = _in_use(sweep), {name: sweep.result(name) for name in sweep.trials}
     statuses = [result.status if result else "not run" for result in results.values()]
     return Tables(
         name=record.name,
@@ -246,7 +270,11 @@ def tables_of(sweep: SweepFolder) -> Tables:
         by=settings.rows,
         rows=list(settings.suites) if settings.rows == "suites" else rows,
         columns=list(dict.fromkeys(_column(place, settings.rows) for place in places)),
-        cells=[cell(place, outcomes[place], settings.paper, settings.metric) for place in places if place in outcomes],
+        cells=[
+            cell(place, outcomes[place], in_use[place], settings.paper, settings.metric)
+            for place in places
+            if place in outcomes
+        ],
         differences=[found for found in differences if found is not None] if not settings.search else [],
         samples=_samples(sweep),
         trials={status: statuses.count(status) for status in dict.fromkeys(statuses)},
@@ -301,6 +329,7 @@ def _lines(found: Cell | None, digits: int) -> list[str]:
     if found.paper is not None:
         mark = " outside" if found.outside else ""
         lines.append(f"paper {found.paper.in_words(digits)}: {found.difference:+.{digits}f}{mark}")
+    lines.append(f"{found.sub_skills_in_use:.1f} sub-skills in use")
     plural = "seed" if len(found.seeds) == 1 else "seeds"
     return [*lines, f"{len(found.seeds)} {plural}, {found.episodes} episodes"]
 
@@ -400,11 +429,12 @@ def _markdown(tables: Tables) -> str:
         for row in tables.rows:
             lines.append(_row([row, *["<br>".join(_lines(grid[row].get(c), digits)) for c in tables.columns]]))
     if tables.cells:
-        lines += ["", "Interquartile means over tasks and seeds, and kinds of interval:", ""]
-        lines += _rows(["row", "where", "interquartile mean", "interval"])
+        lines += ["", "Interquartile means over tasks and seeds; sub-skills with over a tenth of a task's states:", ""]
+        lines += _rows(["row", "where", "interquartile mean", "sub-skills in use", "interval"])
         for found in tables.cells:
             where = f"{found.suite}, {found.split}, {found.shots}-shot"
-            lines.append(_row([found.row, where, f"{found.interquartile_mean:.{digits}f}", found.interval]))
+            middle, in_use = f"{found.interquartile_mean:.{digits}f}", f"{found.sub_skills_in_use:.1f}"
+            lines.append(_row([found.row, where, middle, in_use, found.interval]))
     if tables.differences:
         lines += ["", "On the same seeds and episodes:", ""]
         lines += _rows(["row", "against", "where", "difference", "95% interval", "pairs", "seeds", "differs?"])
@@ -437,7 +467,7 @@ def _latex(tables: Tables) -> str:
     head = [stacked(column.split(", ")) for column in tables.columns]
     lines += [" & ".join(["", *head]) + r" \\", r"\midrule"]
     for row in tables.rows:
-        own = [stacked(_lines(grid[row].get(column), digits)[:-1]) for column in tables.columns]
+        own = [stacked(_lines(grid[row].get(column), digits)[:-2]) for column in tables.columns]
         lines.append(" & ".join([row.translate(_TEX), *own]) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
 

@@ -1,5 +1,6 @@
 """Success rates against the closed form of their interval, and the entropy of sub-skill usage."""
 
+import itertools
 from math import sqrt
 from statistics import NormalDist
 
@@ -8,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmil_core.statistics import share_entropy, success_rate
+from dmil_core.statistics import interquartile_mean, share_entropy, stratified_bootstrap, success_rate
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=200), st.sampled_from([0.8, 0.95, 0.99]))
@@ -46,3 +47,48 @@ def test_share_entropy_at_its_ends(sub_skills: int) -> None:
 def test_share_entropy_known_values() -> None:
     assert share_entropy(np.ones(1)) == 0
     assert share_entropy(np.array([0.5, 0.5, 0.0, 0.0])) == pytest.approx(0.5)
+
+
+def test_bootstrap_of_certain_outcomes_is_certain() -> None:
+    got = stratified_bootstrap(np.full((3, 2, 5), 0.25), np.random.default_rng(0))
+    assert got == (0.25, 0.25, 0.25)
+
+
+def test_bootstrap_of_one_seed_is_as_wide_as_its_episodes_say() -> None:
+    """Four tasks of 50 episodes: the standard error of the stratified mean, and the normal's quantiles."""
+    outcomes = np.array([[[1.0] * solved + [0.0] * (50 - solved) for solved in (5, 25, 40, 50)]])
+    got = stratified_bootstrap(outcomes, np.random.default_rng(0))
+    error = np.sqrt((outcomes.var(2) / 50).sum()) / 4
+    assert got.mean == pytest.approx(0.6)
+    assert got.high - got.low == pytest.approx(2 * 1.96 * error, rel=0.08)
+
+
+def test_bootstrap_of_several_seeds_is_as_wide_as_the_seeds_say() -> None:
+    """Where episodes of a seed are all alike, what is left is the bootstrap of three seeds' means."""
+    outcomes = np.array([0.0, 0.5, 1.0])[:, None, None] * np.ones((3, 2, 10))
+    got = stratified_bootstrap(outcomes, np.random.default_rng(0))
+    assert got == (0.5, 0.0, 1.0), "all three draws are the worst seed in one of 27 cases, which is more than 2.5%"
+    half = stratified_bootstrap(outcomes, np.random.default_rng(0), confidence=0.5)
+    means = [np.mean(draw) for draw in itertools.product([0.0, 0.5, 1.0], repeat=3)]
+    assert (half.low, half.high) == pytest.approx((np.quantile(means, 0.25), np.quantile(means, 0.75)))
+
+
+def test_bootstrap_keeps_every_task_its_weight() -> None:
+    """Tasks of certain outcome add no spread, however different they are."""
+    outcomes = np.stack([np.zeros((3, 20)), np.ones((3, 20))], axis=1)
+    assert stratified_bootstrap(outcomes, np.random.default_rng(0)) == (0.5, 0.5, 0.5)
+
+
+def test_bootstrap_covers_the_truth_about_as_often_as_it_says() -> None:
+    stream, covered = np.random.default_rng(1), 0
+    for _ in range(200):
+        rates = stream.beta(20, 10, size=(8, 1, 1))
+        outcomes = (stream.random((8, 3, 10)) < rates).astype(float)
+        got = stratified_bootstrap(outcomes, stream)
+        covered += got.low <= 2 / 3 <= got.high
+    assert 170 <= covered <= 200
+
+
+def test_interquartile_mean_leaves_out_the_ends() -> None:
+    assert interquartile_mean([100.0, 1.0, 2.0, -50.0]) == 1.5
+    assert interquartile_mean([0.3]) == pytest.approx(0.3)
