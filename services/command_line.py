@@ -34,6 +34,8 @@ PROGRAMS = {
     "meta-train": "collect demonstrations, meta-train, evaluate",
     "collect-demos": "let the scripted experts make demonstrations",
     "evaluate": "adapt a checkpoint to each task and measure its success rates",
+    "tune-sweep": "run an ablation or a search on Ray Tune",
+    "report": "draw what there is to look at, and lay tables out",
 }
 
 

@@ -503,7 +503,7 @@ def _draw(tables: Tables, path: Path) -> None:
                 [paper.spread or 0.0 for _, paper in papers], fmt="s", mfc="none", color=f"C{index}",
                 label=f"{count}-shot, paper" if papers else None,
             )  # fmt: skip
-        axis.set(title=title, ylabel=tables.metric.replace("_", " "), xticks=range(len(rows)), ylim=(0, None))
+        axis.set(title=title, ylabel=tables.metric.replace("_", " "), xticks=range(len(rows)), ylim=top)
         axis.set_xticklabels(rows, rotation=20 if len(rows) > 4 else 0)
         axis.grid(axis="y", alpha=0.3)
         axis.legend(fontsize="small")
