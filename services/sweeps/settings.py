@@ -219,10 +219,12 @@ def planned(sweep: Sweep, size: Size) -> list[PlannedTrial]:
             ).evaluation
             for name, changes in (sweep.evaluations or {None: {}}).items()
         }
-        name = re.sub(r"[^\w.=-]+", "-", f"{suite}-{variant}-seed-{seed}", flags=re.ASCII)
+        name = re.sub(r"[^\w.=-]+", "-", f"{suite}-{variant}-seed-{seed}")
         trials.append(
             PlannedTrial(name=name, variant=variant, suite=suite, seed=seed, config=config, evaluations=evaluations)
         )
+    if len({trial.name for trial in trials}) < len(trials):
+        raise ConfigError(f"variants: got {', '.join(variants)}; wanted names that differ in letters or digits")
     if sweep.search:
         for suite in {trial.config.suite for trial in trials}:
             _only_training_tasks(suite)

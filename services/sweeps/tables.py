@@ -484,6 +484,7 @@ def _draw(tables: Tables, path: Path) -> None:
     panels = list(_panels(tables))
     columns = min(len(panels), 2)
     lines = -(-len(panels) // columns)
+    top = (0, 1.03 if tables.metric == "success_rate" else None)
     figure_, axes = pyplot.subplots(
         lines, columns, figsize=(6.5 * columns, 3.6 * lines), layout="constrained", squeeze=False
     )

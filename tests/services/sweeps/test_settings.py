@@ -109,6 +109,7 @@ def test_a_size_has_its_own_budget() -> None:
     [
         ({"variants": {"one": {"method": {"sub_skill": 3}}}}, "variants.one: got the unknown key method.sub_skill"),
         ({"settings": {"training": {"iterations": -1}}}, "one on ml10: training.iterations: got -1"),
+        ({"variants": {"a b": {}, "a/b": {}}}, "variants: got a b, a/b; wanted names that differ"),
         ({"evaluations": {"a": {"steps": 3}}}, "evaluations.a: got the unknown key evaluation.steps"),
         ({"evaluations": {"a": {"shots": [9]}}}, "evaluations.a: .*held_out: got 20; wanted at least 36"),
     ],
