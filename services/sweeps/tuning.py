@@ -18,7 +18,9 @@ from services.tracking import tracking_uri
 
 __all__ = ["tune_trials"]
 
-logging.getLogger("ray.tune.analysis.experiment_analysis").setLevel(logging.ERROR)  # misses what is not written
+# They tell of files that are not written, and of a lost process by its traceback.
+for _name in ("analysis.experiment_analysis", "execution.tune_controller"):
+    logging.getLogger(f"ray.tune.{_name}").setLevel(logging.CRITICAL)
 
 DEATHS_ALLOWED = 3
 """So often is a trial begun again whose process ended."""
@@ -58,6 +60,10 @@ class Progress(Callback):
     def on_trial_complete(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
         """Say what came of it."""
         self._over(trial)
+
+    def on_trial_recover(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
+        """Say that it is begun again."""
+        console.print(f"{trial.config['trial']}: its process ended; it is begun again", markup=False)
 
     def on_trial_error(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
         """Say that its process ended."""
@@ -145,7 +151,7 @@ def _scheduler(sweep: SweepFolder) -> TrialScheduler | None:
     return AsyncHyperBandScheduler(
         time_attr=ITERATION,
         grace_period=every,
-        max_t=max(config.training.iterations, every + 1),
+        max_t=config.training.iterations + every,  # at which it would stop trials that have come to their end
         reduction_factor=search.reduction,
         metric=HELD_OUT,
         mode="max",
