@@ -63,7 +63,9 @@ class Progress(Callback):
 
     def on_trial_recover(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
         """Say that it is begun again."""
-        console.print(f"{trial.config['trial']}: its process ended; it is begun again", markup=False)
+        name = trial.config["trial"]
+        self._at.pop(name, None)
+        console.print(f"{name}: its process ended; it is begun again", markup=False)
 
     def on_trial_error(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
         """Say that its process ended."""

@@ -184,7 +184,6 @@ def named(processes: Iterable[psutil.Process], name: str) -> list[psutil.Process
 
 @pytest.mark.slow
 @pytest.mark.alone
-@pytest.mark.usefixtures("joined")
 def test_a_trial_that_fails_or_dies_leaves_the_others_alone(
     programs, workplace: Path, mlflow_file: str, wait_for
 ) -> None:
@@ -198,7 +197,9 @@ def test_a_trial_that_fails_or_dies_leaves_the_others_alone(
         "a trial",
         200,
     )
-    for process in named(psutil.process_iter(), "ray::ImplicitFunc"):
+    trials = named(psutil.Process(program.pid).children(recursive=True), "ray::ImplicitFunc")
+    assert trials
+    for process in trials:
         process.send_signal(signal.SIGKILL)
     printed, _ = program.communicate(timeout=240)
     assert program.returncode == 1, printed
@@ -206,6 +207,7 @@ def test_a_trial_that_fails_or_dies_leaves_the_others_alone(
     assert "ml10-spoilt-seed-0: iteration" in printed
     assert "is not finite" in printed
     assert "Traceback" not in printed
+    assert "its process ended; it is begun again" in printed
     tables = json.loads((folder / "tables" / "tables.json").read_text())
     assert tables["trials"] == {"finished": 1, "failed": 1}
     assert {cell["row"] for cell in tables["cells"]} == {"good"}
