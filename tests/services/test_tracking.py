@@ -293,7 +293,9 @@ def test_who_takes_over_begins_where_the_other_ended(tmp_path: Path, mlflow_file
 
 
 def test_what_holds_no_run_is_refused(tmp_path: Path, complaint):
-    assert f"RUN: got '{tmp_path}'; wanted a folder with a tracking.jsonl in it" in complaint(tracking_program, "flush", str(tmp_path))
+    assert f"RUN: got '{tmp_path}'; wanted a folder with a tracking.jsonl in it" in complaint(
+        tracking_program, "flush", str(tmp_path)
+    )
 
 
 @pytest.mark.parametrize("line", ["no JSON", "[]", '["metrics", {"step": 1}]', '["artifact", {"path": "/etc/passwd"}]'])
