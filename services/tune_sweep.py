@@ -27,8 +27,8 @@ from services.ray_runner import RayRunner
 from services.settings_files import read_yaml
 from services.suites.registry import open_suite
 from services.sweeps.folders import MARK, SweepFolder, SweepRecord
+from services.sweeps.layout import publish, show, write_tables
 from services.sweeps.settings import Size, Sweep, planned
-from services.sweeps.tables import publish, show, write_tables
 from services.tracking import Tracker
 
 __all__ = ["Arguments", "run"]

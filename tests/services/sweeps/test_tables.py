@@ -13,8 +13,9 @@ import pytest
 from services import report
 from services.results import AdaptationResult, EpisodeResult, write_rows
 from services.sweeps.folders import SweepError, SweepFolder, SweepRecord, TrialResult
+from services.sweeps.layout import write_tables
 from services.sweeps.settings import Sweep
-from services.sweeps.tables import tables_of, write_tables
+from services.sweeps.tables import tables_of
 
 ROW = {
     "suite": "ml10", "protocol": "p", "method": "dmil", "checkpoint": "c", "draw": 0, "support": ("d",), "data": "s",
