@@ -8,7 +8,7 @@
     runs/trained/DIGEST/evaluated/DIGEST     the rows of one evaluation of it
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -123,9 +123,10 @@ def trained(runs: Path, config: ExperimentConfig, data: Mapping[str, str]) -> Pa
     return runs / TRAINED / sha256((described + digests).encode())[:DIGITS]
 
 
-def evaluated(home: Path, evaluation: EvaluationConfig) -> Path:
-    """Return the folder of an evaluation's rows, in that of the trained configuration."""
-    return home / "evaluated" / sha256(evaluation.model_dump_json(exclude={"every"}).encode())[:DIGITS]
+def evaluated(home: Path, evaluation: EvaluationConfig, tasks: Sequence[str]) -> Path:
+    """Return the folder of an evaluation's rows on some tasks, in that of the trained configuration."""
+    described = "\n".join([evaluation.model_dump_json(exclude={"every"}), *tasks])
+    return home / "evaluated" / sha256(described.encode())[:DIGITS]
 
 
 def _read(path: Path, model: type[Record]) -> Record:

@@ -129,7 +129,7 @@ class Sweep(Settings):
     rows: Literal["variants", "suites"] = "variants"
     """What the table has in its rows; the others are in its columns."""
     splits: tuple[Split, ...] = ("meta-training", "meta-testing")
-    """What the table shows."""
+    """What the trials are evaluated on, and the table shows."""
     resources: Resources = Resources()
     scales: dict[Size, Scale] = Field(default_factory=dict)
     """The budget of each size, where it has one of its own."""

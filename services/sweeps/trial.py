@@ -125,13 +125,14 @@ def _run(sweep: SweepFolder, trial: PlannedTrial, store: DemoStore, tracker: Tra
                 console.print(f"trained already: {home}")
                 _copy_curves(home / "metrics.json", tracker)
             clock.lap("train")
+            tasks = [task for split, task in experiment.tasks if split in sweep.record.sweep.splits]
             folders = {}
             for row, evaluation in trial.evaluations.items():
                 own = Experiment(with_evaluation(config, evaluation), store)
-                folders[row] = evaluated(home, evaluation)
+                folders[row] = evaluated(home, evaluation, tasks)
                 if not (folders[row] / "episodes.jsonl").exists():
                     folders[row].mkdir(parents=True, exist_ok=True)
-                    own.evaluate(runner, data, checkpoint, folders[row])
+                    own.evaluate(runner, data, checkpoint, folders[row], tasks)
             clock.lap("evaluate")
     finally:
         runner.close()

@@ -88,8 +88,10 @@ def test_a_trained_configuration_is_known_by_all_that_trained_it(tmp_path: Path)
     others |= {trained(tmp_path, config, {"reach": "a", "push": "c"}), trained(tmp_path, config, {"reach": "a"})}
     assert len(others | {home}) == 6
     evaluation = config.evaluation
-    assert evaluated(home, evaluation) == evaluated(home, evaluation.model_copy(update={"every": 500}))
-    assert evaluated(home, evaluation) != evaluated(home, evaluation.model_copy(update={"fine_tuning_steps": 51}))
+    once = evaluated(home, evaluation, ["reach", "push"])
+    assert once == evaluated(home, evaluation.model_copy(update={"every": 500}), ["reach", "push"])
+    assert once != evaluated(home, evaluation.model_copy(update={"fine_tuning_steps": 51}), ["reach", "push"])
+    assert once != evaluated(home, evaluation, ["push"])
 
 
 def test_a_size_has_its_own_budget() -> None:
