@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from dmil_core.configs import DmilConfig
+from dmil_core.dmil_config import DmilConfig
 from dmil_core.losses import Steps
 from dmil_core.networks import Parameters, flatten
 

@@ -5,7 +5,8 @@ from typing import Literal, TypeAlias
 import torch
 
 from benchmarks.masked_twin import Sets
-from dmil_core.configs import PRESETS, DmilConfig
+from dmil_core.configs import PRESETS
+from dmil_core.dmil_config import DmilConfig
 from dmil_core.losses import Steps
 from dmil_core.networks import Parameters, flatten, initialise, unflatten
 from dmil_core.seeding import stream
@@ -19,7 +20,8 @@ TRAJECTORY_STEPS = {"paper": 100, "quick": 24}
 
 def settings(size: Size, sub_skills: int, order: Literal["first", "second"]) -> DmilConfig:
     """Return a preset's method with other sub-skills and order: width 512 for ``paper``, 256 for ``quick``."""
-    return PRESETS[f"ml10-{size}"].method.model_copy(update={"sub_skills": sub_skills, "order": order})
+    preset = PRESETS[f"ml10-{size}"].method.model_dump()
+    return DmilConfig.model_validate({**preset, "sub_skills": sub_skills, "order": order})
 
 
 def draw_steps(seed: int, trajectories: int, length: int) -> Steps:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dmil_core.configs import DmilConfig
+from dmil_core.dmil_config import DmilConfig
 from dmil_core.losses import (
     Steps,
     Targets,

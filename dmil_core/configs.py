@@ -1,14 +1,19 @@
 """Settings of an experiment: frozen, checked, and each with the place in the paper that it comes from."""
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
+
+from dmil_core.dmil_config import DmilConfig
+from dmil_core.methods.registry import config_type
+from dmil_core.settings import Count, MethodConfig, NotNegative, Positive, Seed, Settings, Size
 
 __all__ = [
+    "DEFAULT_METHOD",
     "PRESETS",
     "SIZES",
     "DemonstrationConfig",
-    "DmilConfig",
     "EvaluationConfig",
     "ExperimentConfig",
     "SuiteConfig",
@@ -17,19 +22,8 @@ __all__ = [
     "preset_of",
 ]
 
-Count = Annotated[int, Field(ge=1, le=10**9)]
-Size = Annotated[int, Field(ge=1, le=10_000)]
-"""A count of what is held in memory together."""
-Seed = Annotated[int, Field(ge=0, lt=2**63)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 SuiteName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]*$")]
-
-
-class Settings(BaseModel):
-    """Base of all settings: unknown keys are refused, nothing changes once made."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+DEFAULT_METHOD = "dmil"
 
 
 class SuiteConfig(Settings):
@@ -96,46 +90,6 @@ class DemonstrationConfig(Settings):
         return self
 
 
-class DmilConfig(Settings):
-    """Dual Meta Imitation Learning."""
-
-    name: Literal["dmil"] = "dmil"
-    """The method."""
-    sub_skills: Size = 3
-    """K, the number of sub-skills (Table 4)."""
-    hidden_layers: Size = 4
-    """Layers of ReLU units in each network (F.2)."""
-    hidden_units: Size = 512
-    """Units in each hidden layer (F.2)."""
-    output_scale: Positive = 1.0
-    """Scale of the output layers' first weights, against He's; the paper names no initialisation."""
-    standardise: bool = True
-    """Standardise observations by the statistics of the meta-training demonstrations."""
-    inner_learning_rate: Positive = 5e-4
-    """α (Table 9)."""
-    inner_steps: Size = 3
-    """Steps of the inner loop, Table 9's fine-tune iterations."""
-    continuity_weight: NotNegative = 0.1
-    """λ (Table 9; Appendix C says 1)."""
-    adapted: Literal["both", "high", "low"] = "both"
-    """Levels with an inner loop, which are also the ones adapted at test: both; high is DMIL-High and low is DMIL-Low,
-    where the outer loop trains the other level as it is (F.3)."""
-    em: Literal["hard", "soft", "reference_soft"] = "hard"
-    """What the high level learns to predict: the best-fitting sub-skill (equation 3); soft is DMIL_soft (E.6), the
-    posterior softmax(-|a - pi_k(s)|^2 / 2 sigma^2); reference_soft: that of the authors' released code."""
-    posterior_deviation: Positive = 0.5**0.5
-    """σ of the posterior; the paper names none: this one makes it the softmax of the negative squared errors."""
-    continuity: Literal["expected", "reference"] = "expected"
-    """The continuity loss: the expected switches, which have a gradient; or, as in the authors' released code, the
-    count of equation 15, which has none and so only adds to the loss that is shown."""
-    order: Literal["first", "second"] = "second"
-    """Of the meta-gradient: exact, or taken at the adapted parameters."""
-    trajectories: Size = 16
-    """Trajectories in each of τ1 to τ4 (Table 9)."""
-    window: Count | None = None
-    """Cut each trajectory to so many steps at a random place; none takes it whole."""
-
-
 class TrainingConfig(Settings):
     """The outer loop."""
 
@@ -145,8 +99,11 @@ class TrainingConfig(Settings):
     """Tasks in a batch, sampled without replacement where there are enough."""
     slots_per_group: Size = 1
     """Tasks whose gradients one worker computes and adds together; part of the result, unlike the number of workers."""
+    outer_step: Literal["adam", "average"] = "adam"
+    """What an iteration does with its slots' gradients: a step of Adam by their sum; or, for a method whose slots take
+    steps of their own and return how far they went, the way to their mean."""
     learning_rate: Positive = 1e-4
-    """β of the outer Adam (Table 9)."""
+    """β of the outer Adam (Table 9); of the way to the mean, the part that is gone."""
     gradient_clip: Positive | None = None
     """Clip the outer gradient to this norm."""
     checkpoint_every: Count = 200
@@ -172,6 +129,13 @@ class EvaluationConfig(Settings):
     """Evaluate every so many iterations of meta-training too: checkpoints, and so a multiple of checkpoint_every."""
 
 
+def _method_settings(given: object) -> object:
+    """Return settings of a method as those of the method that they name."""
+    if not isinstance(given, Mapping):
+        return given
+    return config_type(given.get("name", DEFAULT_METHOD)).model_validate(given)
+
+
 class ExperimentConfig(Settings):
     """One experiment; with its data it determines every number that comes out."""
 
@@ -179,7 +143,7 @@ class ExperimentConfig(Settings):
     """Of the initial parameters, the task batches and the episodes."""
     suite: SuiteConfig = SuiteConfig()
     demonstrations: DemonstrationConfig = DemonstrationConfig()
-    method: DmilConfig = DmilConfig()
+    method: Annotated[SerializeAsAny[MethodConfig], BeforeValidator(_method_settings)] = DmilConfig()
     training: TrainingConfig = TrainingConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
 
@@ -207,16 +171,6 @@ class ExperimentConfig(Settings):
 SIZES: dict[str, ExperimentConfig] = {
     "paper": ExperimentConfig(),
     "quick": ExperimentConfig(
-        method=DmilConfig(
-            hidden_layers=3,
-            hidden_units=256,
-            output_scale=0.07,
-            inner_learning_rate=5e-3,
-            continuity_weight=0.0,
-            order="first",
-            trajectories=4,
-            window=24,
-        ),
         training=TrainingConfig(
             iterations=4000, slots_per_group=5, learning_rate=1e-3, gradient_clip=10.0, checkpoint_every=500
         ),
@@ -224,14 +178,14 @@ SIZES: dict[str, ExperimentConfig] = {
     ),
     "smoke": ExperimentConfig(
         demonstrations=DemonstrationConfig(per_task=12, held_out=4),
-        method=DmilConfig(hidden_units=32, hidden_layers=2, inner_learning_rate=1e-2, trajectories=2, window=24),
         training=TrainingConfig(
             iterations=20, tasks_per_iteration=3, slots_per_group=1, learning_rate=1e-3, checkpoint_every=10
         ),
         evaluation=EvaluationConfig(episodes=2, support_draws=1, fine_tuning_steps=5),
     ),
 }
-"""Presets by size: the paper's Table 9 to the letter; some minutes on two cores; a minute, to see that all works."""
+"""What the sizes are before a method's own `MethodConfig.sizes`: the paper's Table 9 to the letter; some minutes on two
+cores; a minute, to see that all works."""
 
 SMOKE_TASKS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "ml10": (("reach", "push", "drawer-close"), ("door-close",)),
@@ -246,22 +200,26 @@ SMOKE_TASKS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 """A few meta-training and meta-testing tasks of each suite, for the size smoke."""
 
 
-def preset_of(suite: str, size: str) -> ExperimentConfig:
-    """Return the settings of a size for a suite.
+def preset_of(suite: str, size: str, method: str = DEFAULT_METHOD) -> ExperimentConfig:
+    """Return the settings of a size for a suite and a method.
 
     Raises:
         KeyError: for a size that there is not.
+        MethodError: for a method that there is not.
     """
-    config = SIZES[size]
-    changes: dict[str, Settings] = {"suite": SuiteConfig(name=suite)}
+    config, own = SIZES[size], config_type(method)
+    changes: dict[str, dict[str, Any]] = {"method": {"name": method}, "suite": {"name": suite}}
     if size == "smoke" and suite in SMOKE_TASKS:
-        train, test = SMOKE_TASKS[suite]
-        changes["suite"] = SuiteConfig(name=suite, train_tasks=train, test_tasks=test)
+        changes["suite"] |= dict(zip(("train_tasks", "test_tasks"), SMOKE_TASKS[suite], strict=True))
     if suite.startswith("kitchen"):
-        changes["method"] = config.method.model_copy(update={"sub_skills": 4})  # Table 5's middle column
+        if "sub_skills" in own.model_fields:
+            changes["method"]["sub_skills"] = 4  # Table 5's middle column
         if size == "quick":
-            changes["demonstrations"] = DemonstrationConfig(per_task=50, held_out=12)  # a demonstration takes 1 s
-    return config.model_copy(update=changes)
+            changes["demonstrations"] = {"per_task": 50, "held_out": 12}  # a demonstration takes 1 s
+    settings = config.model_dump(exclude={"method"}) | {"method": {}}
+    for changed in (own.sizes.get(size, {}), changes):
+        settings |= {section: settings[section] | values for section, values in changed.items()}
+    return ExperimentConfig.model_validate(settings)
 
 
 PRESETS: dict[str, ExperimentConfig] = {

@@ -17,7 +17,7 @@ from dmil_core.adaptation import (
     sub_skill_slopes,
     targets_of,
 )
-from dmil_core.configs import DmilConfig
+from dmil_core.dmil_config import DmilConfig
 from dmil_core.losses import Steps, continuity_loss, sub_skill_labels
 from dmil_core.networks import Parameters, unflatten
 from dmil_core.slopes import Slope
@@ -72,11 +72,13 @@ def task_gradient(
 
     probabilities = of_high.outputs.softmax(-1)
     shares = torch.bincount(chosen, minlength=config.sub_skills) / len(chosen)
+    high_loss, low_loss = of_high.loss.value.item(), _total(of_low)
     metrics = {
+        "loss": high_loss + low_loss,
         "high_loss_before": path[0].high.loss.value.item(),
-        "high_loss_after": of_high.loss.value.item(),
+        "high_loss_after": high_loss,
         "low_loss_before": _total(path[0].low),
-        "low_loss_after": _total(of_low),
+        "low_loss_after": low_loss,
         "continuity_loss": continuity_loss(probabilities, query_high.lengths).item(),
         "agreement": (probabilities.argmax(-1) == sub_skill_labels(errors)).float().mean().item(),
         **{f"sub_skill_share/{k}": share for k, share in enumerate(shares.tolist())},

@@ -124,6 +124,8 @@ def flatten(parameters: Parameters) -> Float[Tensor, " size"]:
 
     So a weight's entries lie in the order in which a product with few states reads them fastest.
     """
+    if not parameters:
+        return torch.zeros(0)
     return torch.cat(
         [(tensor.mT if name.endswith(".weight") else tensor).reshape(-1) for name, tensor in parameters.items()]
     )

@@ -1,8 +1,8 @@
 """The outer loop of Algorithm 1: which task sits in which slot, a group's gradient, and the step of Adam."""
 
 import warnings
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -13,14 +13,15 @@ from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import piece_of_work
 from dmil_core.meta_gradient import TaskGradient, tree_sum
-from dmil_core.methods.base import MetaLearner
+from dmil_core.methods.base import MetaLearner, Policy, PractisingLearner, Rollout
 from dmil_core.networks import Parameters
-from dmil_core.seeding import stream
+from dmil_core.seeding import stream, stream_seed
 
 __all__ = [
     "GroupGradient",
     "OuterState",
     "OuterStep",
+    "Practise",
     "SpoiltSlot",
     "add",
     "blocks",
@@ -32,6 +33,10 @@ __all__ = [
 
 BLOCKS_PER_WORKER = 4
 """Blocks that each worker should find at least, so that a slow one takes fewer and the others do not wait."""
+
+
+Practise: TypeAlias = Callable[[Policy, str, int, int], Sequence[Rollout]]
+"""Lets a policy act in a task's environments: policy, task, seed, and steps in all, of whole episodes but the last."""
 
 
 class SpoiltSlot(NamedTuple):
@@ -107,6 +112,7 @@ def group_gradient(
     iteration: int,
     tasks: Sequence[str],
     slots: Sequence[int],
+    practise: Practise,
 ) -> GroupGradient:
     """Return the summed outer gradient of some slots of an iteration: a pure function of its arguments.
 
@@ -118,6 +124,7 @@ def group_gradient(
         iteration: counts from 0.
         tasks: the task of every slot of the iteration, see `tasks_of`.
         slots: which of them to compute.
+        practise: lets a policy act in a task's environments, for a `PractisingLearner`.
 
     Raises:
         WorkError: for a Python error in one of them, which is named.
@@ -126,7 +133,11 @@ def group_gradient(
     for slot in slots:
         task = tasks[slot]
         with piece_of_work(slot_in_words(iteration, slot, task, seed), iteration=iteration, slot=slot):
-            material = method.sample(demonstrations[task], stream(seed, "batch", iteration, slot))
+            material = method.sample(demonstrations[task], iteration, stream(seed, "batch", iteration, slot))
+            if isinstance(method, PractisingLearner) and (steps := method.practice_steps(iteration)):
+                explorer = method.explorer(parameters, material)
+                rollouts = practise(explorer, task, stream_seed(seed, "practice", iteration, slot), steps)
+                material = method.with_practice(material, rollouts)
             result = method.task_gradient(parameters, material)
         if not _finite(result):
             spoilt.append(SpoiltSlot(slot, task, tuple(material.ids)))
@@ -148,19 +159,17 @@ def _finite(result: TaskGradient) -> bool:
 
 
 class OuterStep:
-    """Adam on the flat parameter vector, its state to be taken out and put back at any iteration."""
+    """The step by the sum of all slots' gradients, its state to be taken out and put back at any iteration.
 
-    def __init__(self, state: OuterState, learning_rate: float, gradient_clip: float | None) -> None:
-        """Continue from `state`.
+    Adam on the flat parameter vector; or, with ``outer_step == "average"``, a plain step by the slots' mean, which
+    leaves Adam's moments as they are.
+    """
 
-        Args:
-            state: where to go on; a fresh start is `OuterState.start`.
-            learning_rate: β.
-            gradient_clip: scale a longer gradient down to this norm first; `None` leaves it.
-        """
+    def __init__(self, state: OuterState, training: TrainingConfig) -> None:
+        """Continue from `state`; a fresh start is `OuterState.start`."""
+        self._training = training
         self._parameters = torch.nn.Parameter(torch.tensor(state.parameters))
-        self._clip = gradient_clip
-        self._adam = torch.optim.Adam([self._parameters], lr=learning_rate, fused=True)
+        self._adam = torch.optim.Adam([self._parameters], lr=training.learning_rate, fused=True)
         self._adam.state[self._parameters] = {
             "step": torch.tensor(float(state.iteration)),
             "exp_avg": torch.tensor(state.first_moment),
@@ -177,14 +186,22 @@ class OuterStep:
 
         Where that is not finite, nothing changes.
         """
-        self._parameters.grad = torch.tensor(gradient)
-        norm = torch.nn.utils.clip_grad_norm_([self._parameters], float("inf") if self._clip is None else self._clip)
+        training, total = self._training, torch.tensor(gradient)
+        if training.outer_step == "average":
+            total /= training.tasks_per_iteration
+        self._parameters.grad = total
+        limit = float("inf") if training.gradient_clip is None else training.gradient_clip
+        norm = torch.nn.utils.clip_grad_norm_([self._parameters], limit)
         if norm.isfinite():
-            self._adam.step()
+            if training.outer_step == "adam":
+                self._adam.step()
+            else:
+                self.parameters.sub_(total, alpha=training.learning_rate)
+                self.skip()
         return norm.item()
 
     def skip(self) -> None:
-        """Count an iteration whose step is not taken; parameters and moments stay."""
+        """Count an iteration without a step of Adam; parameters and moments stay."""
         self._adam.state[self._parameters]["step"] += 1
 
     @property

@@ -12,7 +12,8 @@ PROJECT = Path(__file__).parents[1]
 # because its __init__ runs before any of them.
 FLOORS = {
     "dmil_core.demonstrations": 0,
-    "dmil_core.configs": 0,
+    "dmil_core.settings": 0,
+    "dmil_core.dmil_config": 0,
     "dmil_core.errors": 0,
     "dmil_core.statistics": 0,
     "dmil_core.seeding": 0,
@@ -22,6 +23,7 @@ FLOORS = {
     "dmil_core.adaptation": 1,
     "dmil_core.meta_gradient": 1,
     "dmil_core.methods": 2,
+    "dmil_core.configs": 2,
     "dmil_core.outer_loop": 2,
     "services.suites": 3,
     "services.settings_files": 3,

@@ -2,26 +2,41 @@
 
 A method is an immutable value: its settings and what it learned once from the data, such as the standardisation.
 What it learns iteration by iteration are named tensors, which it is handed and never keeps. So every call is a pure
-function of its arguments and can be made again anywhere.
+function of its arguments and can be made again anywhere. What a method needs is said by its type:
 
-How the compared methods fit: MIL keeps the support set in its `Policy`, for its encoder; MLSH makes its high level
-inside `task_gradient` and `adapt`, local to the task, and its policy remembers the macro-step; PEMIRL and nearest
-neighbour have an `adapt` without gradient; nearest neighbour learns nothing and is a `Method` only; OptionGAIL's
-policy remembers the option, and its training material is rollouts beside demonstrations: `MetaLearner` is generic
-in the material of one slot for that.
+- `Method`: turns a support set into a policy, by gradients or without; nearest neighbour is no more than that.
+- `MetaLearner`: also learns across tasks. What is local to a task lives inside `task_gradient` and `adapt`, such as the
+  high level of MLSH; a policy keeps what acting needs, such as the support set in MIL's encoder, and what it must
+  remember from step to step, such as OptionGAIL's option, is its `memory`.
+- `PractisingLearner`: also acts in the environments of meta-training tasks, as OptionGAIL does.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from dmil_core.demonstrations import Demonstration
+from dmil_core.demonstrations import Demonstration, Standardisation
 from dmil_core.meta_gradient import TaskGradient
 from dmil_core.networks import Parameters
+from dmil_core.settings import MethodConfig
 
-__all__ = ["Decision", "Drawn", "FineTuning", "MetaLearner", "Method", "Policy", "SubSkillUse"]
+__all__ = [
+    "Decision",
+    "Drawn",
+    "FineTuning",
+    "MetaLearner",
+    "Method",
+    "Policy",
+    "PractisingLearner",
+    "Rollout",
+    "Standardised",
+    "SubSkillUse",
+    "no_sub_skills",
+]
 
 
 @runtime_checkable
@@ -35,6 +50,8 @@ class Drawn(Protocol):
 
 
 Material = TypeVar("Material", bound=Drawn)
+Config = TypeVar("Config", bound=MethodConfig)
+Own = TypeVar("Own", bound="Standardised[Any]")
 
 
 class Decision(NamedTuple):
@@ -50,6 +67,12 @@ class SubSkillUse(NamedTuple):
 
     chosen: Int64[np.ndarray, " steps"]
     best: Int64[np.ndarray, " steps"]
+
+
+def no_sub_skills(demonstration: Demonstration) -> SubSkillUse:
+    """Return what a method without sub-skills says of a demonstration: sub-skill 0 throughout."""
+    none = np.zeros(len(demonstration), np.int64)
+    return SubSkillUse(none, none)
 
 
 @runtime_checkable
@@ -86,9 +109,12 @@ class FineTuning(NamedTuple):
 class Method(Protocol):
     """Anything that turns a support set into a policy."""
 
-    @property
-    def sub_skills(self) -> int:
-        """The number of sub-skills K, 1 for a method without."""
+    def constants(self) -> Mapping[str, np.ndarray]:
+        """Return what the method learned once from the data, to be stored with its parameters."""
+        ...
+
+    def initial_parameters(self, stream: np.random.Generator) -> Parameters:
+        """Draw the parameters to start from, which may be none."""
         ...
 
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> Policy:
@@ -100,18 +126,92 @@ class Method(Protocol):
 class MetaLearner(Method, Protocol[Material]):
     """A method that learns across tasks, by gradients that add up over the slots of a batch."""
 
-    def constants(self) -> Mapping[str, np.ndarray]:
-        """Return what the method learned once from the data, to be stored with its parameters."""
-        ...
+    def sample(self, demonstrations: Sequence[Demonstration], iteration: int, stream: np.random.Generator) -> Material:
+        """Draw from one task's demonstrations what one slot of an iteration learns from.
 
-    def initial_parameters(self, stream: np.random.Generator) -> Parameters:
-        """Draw the parameters that meta-training starts from."""
-        ...
-
-    def sample(self, demonstrations: Sequence[Demonstration], stream: np.random.Generator) -> Material:
-        """Draw from one task's demonstrations what one slot of an iteration learns from."""
+        Args:
+            demonstrations: of the task.
+            iteration: counts from 0; decides of phases, if there are any.
+            stream: where all is drawn from; what `task_gradient` draws later is named by a seed in the material.
+        """
         ...
 
     def task_gradient(self, parameters: Parameters, material: Material) -> TaskGradient:
-        """Return one slot's outer gradient."""
+        """Return one slot's outer gradient.
+
+        With ``outer_step == "average"`` it is how far the slot's own steps went, the other way round: parameters before
+        minus parameters after. The metrics have the ``loss``, and ``sub_skill_share/K`` where there are sub-skills.
+        """
         ...
+
+
+class Rollout(NamedTuple):
+    """An episode of a policy in meta-training, or its first part."""
+
+    observations: Float32[np.ndarray, "steps+1 obs_dim"]
+    actions: Float32[np.ndarray, "steps action_dim"]
+    """As the policy chose them; the environment clips them."""
+    sub_skills: Int64[np.ndarray, " steps"]
+    success: bool
+    """An episode ends with its first success."""
+    ended: bool
+    """Whether it came to its end, by success or its last step, and was not cut off."""
+
+
+@runtime_checkable
+class PractisingLearner(MetaLearner[Material], Protocol[Material]):
+    """A method that also learns from acting in the environments of meta-training tasks."""
+
+    def practice_steps(self, iteration: int) -> int:
+        """Return how many steps each slot of an iteration acts, which may be none."""
+        ...
+
+    def explorer(self, parameters: Parameters, material: Material) -> Policy:
+        """Return the policy that acts; what is random in it is named by a seed in the material and by its memory."""
+        ...
+
+    def with_practice(self, material: Material, rollouts: Sequence[Rollout]) -> Material:
+        """Return the material with what came of acting."""
+        ...
+
+
+@dataclass(frozen=True)
+class Standardised(ABC, Generic[Config]):
+    """Base of the methods: its settings, and the standardisation as all that is learned once."""
+
+    config: Config
+    action_dim: int
+    standardise: Standardisation
+
+    config_type: ClassVar[type[MethodConfig]]
+    """Of the settings, whose default name is the method's."""
+
+    @classmethod
+    def prepared(cls: type[Own], config: Config, action_dim: int, demonstrations: Sequence[Demonstration]) -> Own:
+        """Return the method with what it learns once from the demonstrations of all meta-training tasks."""
+        if config.standardise:
+            return cls(config, action_dim, Standardisation.of(demonstrations))
+        return cls(config, action_dim, Standardisation.identity(demonstrations[0].observations.shape[1]))
+
+    @classmethod
+    def restored(cls: type[Own], config: Config, action_dim: int, constants: Mapping[str, np.ndarray]) -> Own:
+        """Return the method whose `constants` were stored."""
+        standardise = Standardisation(constants["observation_mean"], constants["observation_scale"])
+        return cls(config, action_dim, standardise)
+
+    def constants(self) -> Mapping[str, np.ndarray]:
+        """Return the observation statistics."""
+        return {"observation_mean": self.standardise.mean, "observation_scale": self.standardise.scale}
+
+    @property
+    def obs_dim(self) -> int:
+        """Numbers in an observation."""
+        return len(self.standardise.mean)
+
+    @abstractmethod
+    def initial_parameters(self, stream: np.random.Generator) -> Parameters:
+        """Draw the parameters to start from, which may be none."""
+
+    @abstractmethod
+    def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> Policy:
+        """Return the policy adapted to the support demonstrations of one task."""

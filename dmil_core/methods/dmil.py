@@ -8,7 +8,7 @@ and the outer loop descends the same losses at the adapted parameters on τ3 and
 DMIL-High and DMIL-Low (F.3) adapt one level only, DMIL_nc (E.5) has λ = 0, DMIL_soft (E.6) a soft target for π_h.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,11 +17,11 @@ from jaxtyping import Float32, Int64
 
 from dmil_core import adaptation, meta_gradient
 from dmil_core.adaptation import Hierarchy
-from dmil_core.configs import DmilConfig
 from dmil_core.demonstrations import Demonstration, Standardisation, TaskBatch, sample_task_batch
+from dmil_core.dmil_config import DmilConfig
 from dmil_core.losses import Steps
 from dmil_core.meta_gradient import TaskGradient
-from dmil_core.methods.base import Decision, FineTuning, SubSkillUse
+from dmil_core.methods.base import Decision, FineTuning, Standardised, SubSkillUse
 from dmil_core.networks import Parameters, initialise
 
 __all__ = ["Dmil", "DmilPolicy"]
@@ -53,38 +53,21 @@ class DmilPolicy:
 
 
 @dataclass(frozen=True)
-class Dmil:
+class Dmil(Standardised[DmilConfig]):
     """DMIL for observations and actions of given sizes."""
 
-    config: DmilConfig
-    action_dim: int
-    standardise: Standardisation
-
-    @classmethod
-    def restored(cls, config: DmilConfig, action_dim: int, constants: Mapping[str, np.ndarray]) -> "Dmil":
-        """Return the method whose `constants` were stored with its parameters."""
-        standardise = Standardisation(constants["observation_mean"], constants["observation_scale"])
-        return cls(config, action_dim, standardise)
-
-    @property
-    def sub_skills(self) -> int:
-        """K."""
-        return self.config.sub_skills
-
-    def constants(self) -> Mapping[str, np.ndarray]:
-        """Return the observation statistics."""
-        return {"observation_mean": self.standardise.mean, "observation_scale": self.standardise.scale}
+    config_type = DmilConfig
 
     def initial_parameters(self, stream: np.random.Generator) -> Parameters:
         """Draw the high level and the bank of sub-skills."""
         hidden = [self.config.hidden_units] * self.config.hidden_layers
-        inputs, k, scale = len(self.standardise.mean), self.config.sub_skills, self.config.output_scale
+        k, scale = self.config.sub_skills, self.config.output_scale
         return {
-            **initialise("high", [inputs, *hidden, k], stream, output_scale=scale),
-            **initialise("low", [inputs, *hidden, self.action_dim], stream, copies=k, output_scale=scale),
+            **initialise("high", [self.obs_dim, *hidden, k], stream, output_scale=scale),
+            **initialise("low", [self.obs_dim, *hidden, self.action_dim], stream, copies=k, output_scale=scale),
         }
 
-    def sample(self, demonstrations: Sequence[Demonstration], stream: np.random.Generator) -> TaskBatch:
+    def sample(self, demonstrations: Sequence[Demonstration], iteration: int, stream: np.random.Generator) -> TaskBatch:
         """Draw τ1 to τ4."""
         return sample_task_batch(demonstrations, self.config.trajectories, self.config.window, stream)
 

@@ -9,18 +9,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from dmil_core.configs import (
-    Count,
-    EvaluationConfig,
-    ExperimentConfig,
-    NotNegative,
-    Seed,
-    Settings,
-    SuiteConfig,
-    SuiteName,
-    preset_of,
-)
+from dmil_core.configs import EvaluationConfig, ExperimentConfig, SuiteConfig, SuiteName, preset_of
 from dmil_core.seeding import stream
+from dmil_core.settings import Count, NotNegative, Seed, Settings
 from services.command_line import ConfigError, checked
 from services.results import Split
 from services.settings_files import merged

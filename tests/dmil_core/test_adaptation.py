@@ -20,7 +20,7 @@ from dmil_core.adaptation import (
     label,
     sub_skill_slopes,
 )
-from dmil_core.configs import DmilConfig
+from dmil_core.dmil_config import DmilConfig
 from dmil_core.losses import Steps
 from dmil_core.networks import BLOCK, Network, Parameters, flatten
 

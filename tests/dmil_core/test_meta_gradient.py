@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch.nn import functional
 
 from benchmarks.masked_twin import MaskedTwin, Sets
-from dmil_core.configs import DmilConfig
+from dmil_core.dmil_config import DmilConfig
 from dmil_core.losses import Steps
 from dmil_core.meta_gradient import task_gradient, tree_sum
 from dmil_core.networks import BLOCK, flatten, unflatten

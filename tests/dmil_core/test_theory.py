@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch.distributions import Independent, Normal
 
 from dmil_core.adaptation import Hierarchy, adapt, choose, high_level_slope, label, sub_skill_slopes
-from dmil_core.configs import DmilConfig
+from dmil_core.dmil_config import DmilConfig
 from dmil_core.losses import Steps
 from dmil_core.networks import Parameters, bank, mlp, network
 

@@ -8,14 +8,15 @@ import pytest
 import torch
 
 from dmil_core import meta_gradient
-from dmil_core.configs import DmilConfig
+from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration, Standardisation
+from dmil_core.dmil_config import DmilConfig
 from dmil_core.losses import Steps
-from dmil_core.meta_gradient import tree_sum
 from dmil_core.methods.base import FineTuning
 from dmil_core.methods.dmil import Dmil
-from dmil_core.networks import flatten, unflatten
+from dmil_core.networks import flatten
 from dmil_core.seeding import stream
+from tests.dmil_core.methods.toys import meta_trained, record, recovered, training_sets
 
 SMALL = DmilConfig(sub_skills=3, hidden_layers=2, hidden_units=8, trajectories=2, window=4, inner_learning_rate=0.05)
 
@@ -56,7 +57,7 @@ def test_constants_restore_the_standardisation(method, demonstrations) -> None:
 
 
 def test_a_sample_has_the_trajectories_and_windows_of_the_settings(method, demonstrations) -> None:
-    batch = method.sample(demonstrations, stream(0, "batch"))
+    batch = method.sample(demonstrations, 0, stream(0, "batch"))
     assert [len(drawn) for drawn in batch.sets] == [2] * 4
     assert max(len(cut) for drawn in batch.sets for cut in drawn) == 4
 
@@ -64,7 +65,7 @@ def test_a_sample_has_the_trajectories_and_windows_of_the_settings(method, demon
 def test_task_gradient_hands_the_four_sets_on_in_order(method, demonstrations) -> None:
     parameters, batch = (
         method.initial_parameters(stream(0, "initial")),
-        method.sample(demonstrations, stream(0, "batch")),
+        method.sample(demonstrations, 0, stream(0, "batch")),
     )
     one, two, three, four = (Steps.of(drawn, method.standardise) for drawn in batch.sets)
     expected = meta_gradient.task_gradient(parameters, one, two, three, four, SMALL)
@@ -81,7 +82,7 @@ def test_a_single_step_can_be_learned_from(make_demonstrations, order: Literal["
     settings = SMALL.model_copy(update={"order": order, "continuity_weight": 0.1})
     method = Dmil(settings, action_dim=3, standardise=Standardisation.of(demonstrations))
     parameters = method.initial_parameters(stream(0, "initial"))
-    found = method.task_gradient(parameters, method.sample(demonstrations, stream(0, "batch")))
+    found = method.task_gradient(parameters, method.sample(demonstrations, 0, stream(0, "batch")))
     assert torch.isfinite(found.gradient).all()
     assert found.gradient.any()
     assert all(np.isfinite(value) for value in found.metrics.values())
@@ -127,68 +128,36 @@ def test_adaptation_leaves_the_parameters(method, demonstrations, steps: int) ->
     assert torch.equal(flatten(policy.hierarchy.parameters), before) == (steps == 0)
 
 
-def point_mass(task: int, episodes: int, steps: int = 16) -> tuple[list[Demonstration], np.ndarray]:
-    """Demonstrate one task: a point circles the origin, driven by one linear policy above the axis, another below.
-
-    The policies differ from task to task, the side that each belongs to does not. Also returned: which policy acted.
-    """
-    random = stream(task, "point mass")
-    turn, drift = np.array([[0, -1], [1, 0]]), np.array([[2.0, 0.5], [-2.0, -0.5]])
-    gains, drifts = turn + random.normal(size=(2, 2, 2)) * 0.1, drift + random.normal(size=(2, 2)) * 0.3
-    demonstrations, skills = [], []
-    for episode in range(episodes):
-        places, actions, position = [], [], random.uniform(-1, 1, 2)
-        for _ in range(steps):
-            skill = int(position[1] > 0)
-            places.append(position)
-            actions.append(gains[skill] @ position + drifts[skill])
-            skills.append(skill)
-            position = np.clip(position + 0.3 * actions[-1], -1, 1)
-        demonstrations.append(
-            Demonstration(f"d{episode}", f"t{task}", np.array(places, np.float32), np.array(actions, np.float32))
-        )
-    return demonstrations, np.array(skills)
-
-
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("order", ["first", "second"])
 def test_learns_to_tell_two_skills_apart_in_a_new_task(order: Literal["first", "second"]) -> None:
     config = DmilConfig(
         sub_skills=2,
         hidden_layers=1,
-        hidden_units=16,
+        hidden_units=32,
+        output_scale=0.1,
         trajectories=4,
         inner_learning_rate=0.05,
         inner_steps=2,
         continuity_weight=0.0,
         order=order,
     )
-    training = [point_mass(task, 16)[0] for task in range(6)]
-    method = Dmil(config, action_dim=2, standardise=Standardisation.of(list(itertools.chain(*training))))
-    initial = method.initial_parameters(stream(0, "initial"))
-    shapes = {name: tensor.shape for name, tensor in initial.items()}
-    vector = flatten(initial).requires_grad_()
-    optimiser = torch.optim.Adam([vector], lr=1e-2)
-    for iteration in range(200):
-        parameters, gradients = unflatten(vector.detach(), shapes), []
-        for slot in range(3):
-            random = stream(0, "batch", iteration, slot)
-            material = method.sample(training[random.integers(len(training))], random)
-            gradients.append(method.task_gradient(parameters, material).gradient)
-        vector.grad = tree_sum(gradients)
-        optimiser.step()
-
-    demonstrations, skills = point_mass(100, 30)
-    observations, actions = (
-        np.concatenate([getattr(demonstration, field) for demonstration in demonstrations])
-        for field in ("observations", "actions")
-    )
-    agreements, errors = [], []
-    for steps in (0, 20):
-        policy = method.adapt(unflatten(vector.detach(), shapes), demonstrations[:2], FineTuning(steps, 0.05))
-        decision = policy.act(observations, policy.start(len(observations)))
-        agreements.append((decision.sub_skills == skills).mean())
-        errors.append(np.square(decision.actions - actions).sum(1).mean() / actions.var(0).sum())
-    assert max(agreements[-1], 1 - agreements[-1]) >= 0.95
-    assert errors[-1] < 0.05
-    assert errors[-1] < errors[0] / 2
+    sets = training_sets()
+    method = Dmil.prepared(config, 2, list(itertools.chain(*sets.values())))
+    parameters = meta_trained(method, sets, TrainingConfig(iterations=500, tasks_per_iteration=4, learning_rate=1e-2))
+    demonstrations, skills = record(101, 12)
+    found, errors = [], []
+    for steps in (0, 100):
+        policy = method.adapt(parameters, demonstrations[:2], FineTuning(steps, 0.1))
+        found.append(recovered(skills, [policy.sub_skill_use(one).chosen for one in demonstrations]))
+        decisions = [policy.act(one.observations, policy.start(len(one))) for one in demonstrations]
+        errors.append(
+            np.mean(
+                [
+                    np.square(did.actions - one.actions).sum(1).mean()
+                    for did, one in zip(decisions, demonstrations, strict=True)
+                ]
+            )
+        )
+    assert found[-1] >= 0.95
+    assert errors[-1] < errors[0]
