@@ -24,7 +24,8 @@ from rich.table import Table
 from benchmarks.cluster_model import Costs, Network, Prediction, calls_of_a_tree, predict
 from benchmarks.timing import alternate, write_rows
 from dmil_core.configs import PRESETS
-from dmil_core.demonstrations import Demonstration, Standardisation
+from dmil_core.demonstrations import Demonstration
+from dmil_core.dmil_config import DmilConfig
 from dmil_core.methods.dmil import Dmil
 from dmil_core.networks import flatten
 from dmil_core.outer_loop import OuterState, add
@@ -114,8 +115,8 @@ def made_up_plan(size: Size) -> Plan:
         ]
         for task in suite.train_tasks
     }
-    standardise = Standardisation.of([d for task in demonstrations.values() for d in task])
-    method = Dmil(config.method, suite.action_dim, standardise)
+    assert isinstance(config.method, DmilConfig)
+    method = Dmil.prepared(config.method, suite.action_dim, [d for task in demonstrations.values() for d in task])
     initial = method.initial_parameters(stream(0, "initial parameters"))
     shapes = {name: tensor.shape for name, tensor in initial.items()}
     state = OuterState.start(flatten(initial).numpy())

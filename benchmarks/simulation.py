@@ -30,7 +30,8 @@ from rich.table import Table
 
 from benchmarks.timing import alternate, write_rows
 from dmil_core.configs import PRESETS, EvaluationConfig, SuiteConfig
-from dmil_core.demonstrations import Demonstration, Standardisation
+from dmil_core.demonstrations import Demonstration
+from dmil_core.dmil_config import DmilConfig
 from dmil_core.methods.base import FineTuning, Policy
 from dmil_core.methods.dmil import Dmil
 from dmil_core.networks import Parameters, flatten
@@ -278,7 +279,8 @@ def one_policy(
                 found.append(Demonstration(str(seed), task, attempt.observations[:-1], attempt.actions))
             seed += 1
     support = [demonstration for found in demonstrations.values() for demonstration in found]
-    method = Dmil(config.method, suite.action_dim, Standardisation.of(support))
+    assert isinstance(config.method, DmilConfig)
+    method = Dmil.prepared(config.method, suite.action_dim, support)
     initial = method.initial_parameters(stream(config.seed, "initial parameters"))
     policy = method.adapt(initial, support, FineTuning(steps, config.evaluation.learning_rate))
     return method, policy.hierarchy.parameters, demonstrations

@@ -112,7 +112,7 @@ def group_gradient(
     iteration: int,
     tasks: Sequence[str],
     slots: Sequence[int],
-    practise: Practise,
+    practise: Practise | None = None,
 ) -> GroupGradient:
     """Return the summed outer gradient of some slots of an iteration: a pure function of its arguments.
 
@@ -135,6 +135,7 @@ def group_gradient(
         with piece_of_work(slot_in_words(iteration, slot, task, seed), iteration=iteration, slot=slot):
             material = method.sample(demonstrations[task], iteration, stream(seed, "batch", iteration, slot))
             if isinstance(method, PractisingLearner) and (steps := method.practice_steps(iteration)):
+                assert practise is not None
                 explorer = method.explorer(parameters, material)
                 rollouts = practise(explorer, task, stream_seed(seed, "practice", iteration, slot), steps)
                 material = method.with_practice(material, rollouts)

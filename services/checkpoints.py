@@ -53,8 +53,11 @@ class Manifest(BaseModel):
     loss: float | None
     """Mean loss after adaptation since the checkpoint before, by which the best is chosen."""
     config: ExperimentConfig
-    shapes: Annotated[dict[str, Shape], Field(min_length=1)]
-    """Names and shapes of the parameters, in the order in which they are laid out flat."""
+    shapes: dict[str, Shape]
+    """Names and shapes of the parameters, in the order in which they are laid out flat; none of a method that learns
+    nothing."""
+    environment_steps: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    """Taken in meta-training, by a method that practises."""
     data: dict[str, str]
     """The SHA-256 of each task's demonstrations."""
     versions: dict[str, str]

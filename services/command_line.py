@@ -3,7 +3,7 @@
 import argparse
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -11,7 +11,15 @@ from typing import Any, NoReturn, TypeVar
 import tyro
 from pydantic import ValidationError
 
-from dmil_core.configs import PRESETS, SIZES, EvaluationConfig, ExperimentConfig, SuiteConfig, preset_of
+from dmil_core.configs import (
+    DEFAULT_METHOD,
+    PRESETS,
+    SIZES,
+    EvaluationConfig,
+    ExperimentConfig,
+    SuiteConfig,
+    preset_of,
+)
 from dmil_core.errors import RunError, UserError, explain, shown
 from services.settings_files import ConfigError, merged, read_yaml
 
@@ -22,6 +30,7 @@ __all__ = [
     "defaults_from",
     "exit_code",
     "main",
+    "method_named",
     "parse",
     "peek",
     "suite_settings",
@@ -40,26 +49,29 @@ PROGRAMS = {
 
 
 def defaults_from(arguments: Sequence[str]) -> ExperimentConfig:
-    """Return what ``--preset``, ``--suite``, ``--config`` and ``--demos`` in a program's arguments say all others are.
+    """Return what ``--preset``, ``--suite``, ``--method``, ``--config`` and ``--demos`` say all other settings are.
 
     Raises:
         ConfigError: as `config_from`.
     """
-    early = peek(arguments, preset=str, suite=str, config=Path, demos=str)
-    config = config_from(early.preset or DEFAULT_PRESET, early.config, early.suite)
+    early = peek(arguments, preset=str, suite=str, method=str, config=Path, demos=str)
+    config = config_from(early.preset or DEFAULT_PRESET, early.config, early.suite, early.method)
     if early.demos is None:
         return config
     demonstrations = config.demonstrations.model_copy(update={"source": early.demos})
     return config.model_copy(update={"demonstrations": demonstrations})
 
 
-def config_from(preset: str, file: Path | None, suite: str | None = None) -> ExperimentConfig:
+def config_from(
+    preset: str, file: Path | None, suite: str | None = None, method: str | None = None
+) -> ExperimentConfig:
     """Return a preset's settings, with those that a YAML file gives in their place.
 
     Args:
         preset: a size, or a suite and a size as ml10-quick.
         file: of settings.
         suite: in place of the preset's.
+        method: in place of the file's, or of DMIL.
 
     Raises:
         ConfigError: names the key, what it got and what is allowed.
@@ -69,13 +81,21 @@ def config_from(preset: str, file: Path | None, suite: str | None = None) -> Exp
         raise ConfigError(
             f"--preset: got {preset!r}; wanted {', '.join(SIZES)}, with --suite, or one of {', '.join(PRESETS)}"
         )
+    given = {} if file is None else read_yaml(file, "--config")
     try:
-        settings = preset_of(suite or named or DEFAULT_SUITE, size).model_dump()
+        settings = preset_of(suite or named or DEFAULT_SUITE, size, method or method_named(given)).model_dump()
     except ValidationError as error:
         raise _no_name(suite) from error
-    if file is not None:
-        settings = merged(settings, read_yaml(file, "--config"), str(file))
+    settings = merged(settings, given, str(file))
+    if method is not None:
+        settings["method"]["name"] = method
     return checked(settings, "" if file is None else f"{file}: ")
+
+
+def method_named(given: Mapping[Any, Any]) -> Any:
+    """Return the method that some settings, by section, are of."""
+    section = given.get("method")
+    return section.get("name", DEFAULT_METHOD) if isinstance(section, Mapping) else DEFAULT_METHOD
 
 
 def suite_settings(suite: str, tasks: Sequence[str] | None = None) -> SuiteConfig:

@@ -10,7 +10,9 @@ import torch
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import Demonstration
-from dmil_core.methods.dmil import Dmil
+from dmil_core.methods.base import Standardised
+from dmil_core.methods.registry import method_type
+from dmil_core.settings import sub_skills_of
 from services.checkpoints import Checkpoint, Checkpoints
 from services.demo_store import TaskDemonstrations
 from services.failures import keeping_failures
@@ -85,12 +87,13 @@ class Evaluator:
                 "data": self._data[trial.task].digest,
             }
             episodes += _episode_rows(row, trial, outcome)
-            adaptations.append(_adaptation_row(row, outcome, self.config.method.sub_skills))
+            adaptations.append(_adaptation_row(row, outcome, sub_skills_of(self.config.method)))
         failed = {task: dataset.failed for task, dataset in self._data.items()}
         return Evaluation(checkpoint, self._suite.protocol, self._suite.best_score, failed, episodes, adaptations)
 
-    def _method(self, checkpoint: Checkpoint) -> Dmil:
-        return Dmil.restored(self.config.method, self._suite.action_dim, checkpoint.constants)
+    def _method(self, checkpoint: Checkpoint) -> Standardised[Any]:
+        settings = self.config.method
+        return method_type(settings.name).restored(settings, self._suite.action_dim, checkpoint.constants)
 
 
 class Evaluations:
@@ -163,7 +166,7 @@ class Evaluations:
         iteration = checkpoint.manifest.iteration
         evaluation = self._evaluator.evaluation(checkpoint, outcomes)
         write_evaluation(evaluation, self._folder / f"{iteration:07d}")
-        found = cells(evaluation.episodes, evaluation.best_score, self._evaluator.config.method.sub_skills)
+        found = cells(evaluation.episodes, evaluation.best_score, self._evaluator.config.method)
         self._tracker.metrics(iteration, rates(found, sub_skill_use(evaluation.adaptations)))
         in_words = "; ".join(f"{cell.split} {cell.shots}-shot {cell.success_rate:.3f}" for cell in found)
         console.print(f"success rates after {iteration} iterations: {in_words}")

@@ -3,15 +3,16 @@
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 
 from dmil_core.configs import ExperimentConfig
-from dmil_core.demonstrations import Demonstration, Standardisation
+from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import RunError, UserError
-from dmil_core.methods.dmil import Dmil
+from dmil_core.methods.base import MetaLearner, Method, Standardised
+from dmil_core.methods.registry import method_type
 from dmil_core.networks import Parameters, flatten, unflatten
 from dmil_core.outer_loop import OuterState
 from dmil_core.seeding import stream
@@ -149,16 +150,26 @@ class Experiment:
 
     # Meta-training
 
-    def method(self, training_sets: Mapping[str, Sequence[Demonstration]]) -> Dmil:
+    def method(self, training_sets: Mapping[str, Sequence[Demonstration]]) -> Standardised[Any]:
         """Return the method, with what it learns once from the training demonstrations."""
-        settings = self.config.method
-        if settings.standardise:
-            standardise = Standardisation.of([d for task in training_sets.values() for d in task])
-        else:
-            standardise = Standardisation.identity(self.suite.obs_dim)
-        return Dmil(settings, self.suite.action_dim, standardise)
+        settings, demonstrations = self.config.method, [d for task in training_sets.values() for d in task]
+        return method_type(settings.name).prepared(settings, self.suite.action_dim, demonstrations)
 
-    def initial_parameters(self, method: Dmil) -> Parameters:
+    def meta_learner(self, training_sets: Mapping[str, Sequence[Demonstration]]) -> MetaLearner[Any]:
+        """Return the method, as one that is meta-trained.
+
+        Raises:
+            UserError: if it is none.
+        """
+        method = self.method(training_sets)
+        if isinstance(method, MetaLearner):
+            return method
+        raise UserError(
+            f"training.iterations: got {self.config.training.iterations}; wanted 0: {self.config.method.name} has no "
+            "meta-training"
+        )
+
+    def initial_parameters(self, method: Method) -> Parameters:
         """Draw the parameters that meta-training starts from."""
         return method.initial_parameters(stream(self.config.seed, "initial parameters"))
 
@@ -194,12 +205,13 @@ class Experiment:
         """
         settings = self.config.training
         sets = self.training_sets(data)
-        method = self.method(sets)
+        method = self.meta_learner(sets) if settings.iterations else self.method(sets)
         initial = self.initial_parameters(method)
         shapes = {name: tensor.shape for name, tensor in initial.items()}
         digests = {task: dataset.digest for task, dataset in data.items()}
         _same_data(resume, digests, self.store)
         state = OuterState.start(flatten(initial).numpy()) if resume is None else resume.state
+        environment_steps = 0 if resume is None else resume.manifest.environment_steps
 
         def save(state: OuterState, loss: float | None) -> Path:
             parameters = unflatten(torch.tensor(state.parameters), shapes)
@@ -208,6 +220,7 @@ class Experiment:
                 loss=loss,
                 config=self.config,
                 shapes={name: tuple(shape) for name, shape in shapes.items()},
+                environment_steps=environment_steps,
                 data=digests,
                 versions=library_versions(),
                 mlflow_run_id=tracker.identify(patience=20.0 if state.iteration == settings.iterations else 0.0),
@@ -223,10 +236,12 @@ class Experiment:
             overlap=overlap_evaluation,
         )
         evaluations.make_up()
-        if state.iteration >= settings.iterations and resume is not None:
+        if state.iteration >= settings.iterations:
             evaluations.finish()
-            return resume
-        plan = Plan(method, shapes, sets, state, settings, self.config.seed, skip_nonfinite=on_nonfinite == "skip")
+            return resume or Checkpoint(save(state, None))
+        assert isinstance(method, MetaLearner)
+        skip = on_nonfinite == "skip"
+        plan = Plan(method, shapes, sets, state, settings, self.config.seed, skip, self.suite)
         training = runner.meta_train(plan)
         collapse = CollapseWatch()
         losses: list[float] = []
@@ -246,6 +261,7 @@ class Experiment:
                 for iteration in training.iterations(settings.iterations - state.iteration):
                     done = iteration.number
                     metrics = _iteration_metrics(iteration)
+                    environment_steps += int(metrics.get("environment_steps", 0))
                     if not iteration.stepped:
                         told = _nonfinite_in_words(iteration)
                         if on_nonfinite == "stop":
@@ -253,7 +269,7 @@ class Experiment:
                             raise NonFiniteError(told, checkpoints.folder.parent)
                         console.print(f"warning: {told}; the step is not taken")
                     else:
-                        losses.append(metrics["high_loss_after"] + metrics["low_loss_after"])
+                        losses.append(metrics["loss"])
                     tracker.metrics(done, {name: value for name, value in metrics.items() if np.isfinite(value)})
                     bar.advance(1, _in_words(metrics))
                     if warning := collapse.look(done, metrics):
@@ -267,7 +283,8 @@ class Experiment:
                         if evaluations.is_due(done):
                             evaluations.begin(Checkpoint(path))
                 evaluations.finish()
-            return Checkpoint(path or save(training.state(), None))
+            assert path is not None
+            return Checkpoint(path)
         except KeyboardInterrupt:
             save_now()
             raise
@@ -340,8 +357,11 @@ def _nonfinite_in_words(iteration: Iteration) -> str:
 def _iteration_metrics(iteration: Iteration) -> dict[str, float]:
     """Return an iteration's metrics: the means over its slots, what they say together, and how fast it went."""
     metrics = {name: float(np.mean([slot[name] for slot in iteration.slots])) for name in iteration.slots[0]}
+    if "environment_steps" in metrics:
+        metrics["environment_steps"] *= len(iteration.slots)
+    if len(shares := _shares(metrics)) > 1:
+        metrics["sub_skill_entropy"] = share_entropy(shares)
     return metrics | {
-        "sub_skill_entropy": share_entropy(_shares(metrics)),
         "gradient_norm": iteration.gradient_norm,
         "iterations_per_second": 1 / iteration.timing.iteration,
         "overhead_share": iteration.timing.overhead_share,
@@ -354,8 +374,5 @@ def _shares(metrics: Mapping[str, float]) -> np.ndarray:
 
 def _in_words(metrics: Mapping[str, float]) -> str:
     shares = _shares(metrics)
-    return (
-        f"losses {metrics['high_loss_after']:.3f} high, {metrics['low_loss_after']:.3f} low; "
-        f"sub-skills in use {(shares > 0.01).sum()}/{len(shares)}; "
-        f"{metrics['iterations_per_second']:.1f} iterations/s"
-    )
+    in_use = f"sub-skills in use {(shares > 0.01).sum()}/{len(shares)}; " if len(shares) > 1 else ""
+    return f"loss {metrics['loss']:.3f}; {in_use}{metrics['iterations_per_second']:.1f} iterations/s"

@@ -14,7 +14,7 @@ from typing import Annotated
 import tyro
 from pydantic import ValidationError
 
-from dmil_core.configs import ExperimentConfig
+from dmil_core.configs import DEFAULT_METHOD, ExperimentConfig
 from dmil_core.errors import explain
 from services.checkpoints import Checkpoint, Checkpoints
 from services.command_line import DEFAULT_PRESET, ConfigError, defaults_from, exit_code, parse, peek
@@ -47,6 +47,9 @@ class Arguments:
     also with the suite's name before, as ml10-quick."""
     suite: str | None = None
     """The suite, as ml10, ml45, ML1-reach, push-around-wall or kitchen; short for --suite.name."""
+    method: str | None = None
+    """The method: dmil, option-gail, option-gail-offline, mil, mlsh, pemirl, behaviour-cloning, per-task,
+    nearest-neighbour, or what an installed package brings; its settings are then those of --method.… below."""
     demos: str | None = None
     """Where demonstrations come from, as minari:ID,TASK=ID; short for --demonstrations.source."""
     config: Path | None = None
@@ -113,16 +116,18 @@ def run(arguments: Sequence[str]) -> None:
 
 def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]:
     """Return the arguments, the run's folder, and the checkpoint to go on from."""
-    early = peek(arguments, resume=str, runs=Path, preset=str, config=Path, suite=str, demos=str)
+    early = peek(arguments, resume=str, runs=Path, preset=str, config=Path, suite=str, method=str, demos=str)
     if early.resume is None:
         given = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(arguments)))
-        kind = f"{given.experiment.suite.name}-{given.preset.rpartition('-')[2]}"
+        config = given.experiment
+        named = "" if config.method.name == DEFAULT_METHOD else f"{config.method.name}-"
+        kind = f"{config.suite.name}-{named}{given.preset.rpartition('-')[2]}"
         folder = new_folder(given.name or f"{kind}-{datetime.now():%Y%m%d-%H%M%S}", given.runs, MARK)
         return given, folder, None
-    if early.preset or early.config or early.suite or early.demos:
+    if early.preset or early.config or early.suite or early.method or early.demos:
         raise ConfigError(
-            "--resume: got --preset, --config, --suite or --demos with it; wanted none: a run goes on with its own "
-            "settings"
+            "--resume: got --preset, --config, --suite, --method or --demos with it; wanted none: a run goes on with "
+            "its own settings"
         )
     folder = find_folder(early.resume, early.runs or Arguments.runs, MARK)
     try:

@@ -7,13 +7,21 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from dmil_core.dmil_config import DmilConfig
+from dmil_core.settings import MethodConfig
 from services.results import Split
 
-__all__ = ["Published", "dmil_figure", "figure"]
+__all__ = ["Published", "figure", "figure_of"]
 
 BENCHMARKS = {"ml10": "ML10", "ml45": "ML45"}
 KITCHENS = ("kitchen-topburner", "kitchen-microwave", "kitchen-kettle", "kitchen-slide")
 """The rows of Table 5; of the last two, which hold the same sub-tasks, the paper does not say which is which."""
+
+
+ROWS = {"option-gail": "OptionGAIL"}
+"""Of Table 4, by method."""
+VARIANTS = {"both": "DMIL", "high": "DMIL-High", "low": "DMIL-Low"}
+"""Rows of Table 4, by the levels that DMIL adapts."""
 
 
 class Published(BaseModel):
@@ -57,8 +65,10 @@ def figure(table: str, row: str, suite: str, split: Split, shots: int) -> Publis
     return Published(value=means[key], spread=figures.get("spread", {}).get(key), table=title)
 
 
-def dmil_figure(suite: str, split: Split, shots: int, sub_skills: int) -> Published | None:
-    """Return the paper's figure for DMIL: success rates (Table 4, K = 3), or scores (Table 5)."""
+def figure_of(method: MethodConfig, suite: str, split: Split, shots: int) -> Published | None:
+    """Return the paper's figure for a method: success rates (Table 4, K = 3), or DMIL's scores (Table 5)."""
+    if not isinstance(method, DmilConfig):
+        return figure("table4", ROWS.get(method.name, ""), suite, split, shots)
     if suite in KITCHENS:
-        return figure("table5", f"K={sub_skills}", suite, split, shots)
-    return figure("table4", "DMIL", suite, split, shots)
+        return figure("table5", f"K={method.sub_skills}", suite, split, shots)
+    return figure("table4", VARIANTS[method.adapted], suite, split, shots)

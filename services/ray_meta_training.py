@@ -65,7 +65,7 @@ class RayMetaTraining:
         self._workers: Callable[[], int] = workers if callable(workers) else lambda: workers
         remote, shared = ray.remote(num_cpus=1, num_gpus=gpus)(AdaptationWorker), ray.put(plan.demonstrations)
         self._pool = Pool(
-            lambda: remote.remote(plan.method, plan.shapes, shared, plan.seed),
+            lambda: remote.remote(plan.method, plan.shapes, shared, plan.seed, plan.suite),
             size=self._wanted,
             ahead=2,
             say=console.print,

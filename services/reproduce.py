@@ -51,15 +51,15 @@ def _attempt(failure: Failure, experiment: Experiment) -> Callable[[], object]:
 def _slot(failure: Failure, experiment: Experiment) -> Callable[[], object]:
     data = experiment.collect(LocalRunner(experiment.suite))
     sets = experiment.training_sets(data)
-    method, checkpoint, config = experiment.method(sets), _checkpoint(failure), failure.config
+    method, checkpoint, config = experiment.meta_learner(sets), _checkpoint(failure), failure.config
     shapes = {name: torch.Size(shape) for name, shape in checkpoint.manifest.shapes.items()}
     parameters = unflatten(torch.from_numpy(checkpoint.state.parameters), shapes)
     iteration = int(failure.piece["iteration"])
     if checkpoint.manifest.iteration != iteration:
         raise RunError(f"{checkpoint.path}: got iteration {checkpoint.manifest.iteration}; wanted {iteration}")
     tasks = tasks_of(iteration, list(sets), config.seed, config.training.tasks_per_iteration)
-    slot = int(failure.piece["slot"])
-    return lambda: group_gradient(method, sets, parameters, config.seed, iteration, tasks, [slot])
+    slot, worker = int(failure.piece["slot"]), SimulationWorker(experiment.suite)
+    return lambda: group_gradient(method, sets, parameters, config.seed, iteration, tasks, [slot], worker.practise)
 
 
 def _trial(failure: Failure, experiment: Experiment) -> Callable[[], object]:

@@ -8,13 +8,23 @@ from gymnasium.spaces import Box
 
 from dmil_core.configs import DemonstrationConfig, EvaluationConfig
 from dmil_core.demonstrations import Demonstration
-from dmil_core.methods.base import FineTuning, Method, Policy, SubSkillUse
+from dmil_core.methods.base import FineTuning, Method, Policy, Rollout, SubSkillUse
 from dmil_core.networks import Parameters
 from dmil_core.seeding import stream, stream_seed
 from services.results import Split
 from services.suites.base import Attempt, Environment, Expert
 
-__all__ = ["Episode", "Trial", "TrialOutcome", "demonstrate", "rollout", "trials", "try_out"]
+__all__ = [
+    "Episode",
+    "Trial",
+    "TrialOutcome",
+    "demonstrate",
+    "episodes_beside",
+    "practise",
+    "rollout",
+    "trials",
+    "try_out",
+]
 
 
 class Trial(NamedTuple):
@@ -85,6 +95,63 @@ def rollout(policy: Policy, envs: Sequence[Environment], seeds: Sequence[int], h
     return [
         Episode(seed, goal, bool(done), int(best), len(chosen), np.bincount(chosen).tolist())
         for seed, goal, done, best, chosen in zip(seeds, goals, success, score, choices, strict=True)
+    ]
+
+
+def episodes_beside(steps: int, horizon: int) -> int:
+    """Return how many episodes act in lockstep where a policy practises for so many steps."""
+    return max(1, steps // horizon)
+
+
+def practise(policy: Policy, envs: Sequence[Environment], seed: int, steps: int, horizon: int) -> list[Rollout]:
+    """Let a policy act for so many steps in all, in rounds of `episodes_beside` episodes; the last ones may be cut off.
+
+    An episode ends as in `rollout`.
+
+    Args:
+        policy: what acts.
+        envs: of one task, at least as many as act beside each other.
+        seed: names the episodes.
+        steps: of all episodes together.
+        horizon: of an episode.
+    """
+    rollouts: list[Rollout] = []
+    while steps > 0:
+        numbers = range(len(rollouts), len(rollouts) + episodes_beside(steps, horizon))
+        seeds = [stream_seed(seed, "episode", number) for number in numbers]
+        found = _recorded(policy, envs, seeds, min(horizon, steps), horizon)
+        steps -= sum(len(rollout.actions) for rollout in found)
+        rollouts += found
+    return rollouts
+
+
+def _recorded(
+    policy: Policy, envs: Sequence[Environment], seeds: Sequence[int], most: int, horizon: int
+) -> list[Rollout]:
+    """Record an episode for each seed, of at most so many steps."""
+    first = [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=False)]
+    observations = [[observation.astype(np.float32)] for observation in first]
+    actions: list[list[np.ndarray]] = [[] for _ in seeds]
+    sub_skills: list[list[int]] = [[] for _ in seeds]
+    success, ended = np.zeros(len(seeds), bool), np.full(len(seeds), most == horizon)
+    alive, memory = np.arange(len(seeds)), policy.start(len(seeds))
+    for _ in range(most):
+        decision = policy.act(np.stack([observations[index][-1] for index in alive]), memory)
+        if not np.isfinite(decision.actions).all():
+            raise FloatingPointError("got an action that is not finite; wanted a policy that has not diverged")
+        for index, action, sub_skill in zip(alive.tolist(), decision.actions, decision.sub_skills, strict=True):
+            observation, _, _, _, info = envs[index].step(_clip(action, envs[index]))
+            observations[index].append(observation.astype(np.float32))
+            actions[index].append(action)
+            sub_skills[index].append(int(sub_skill))
+            success[index] = info["success"]
+        going_on = ~success[alive]
+        alive, memory = alive[going_on], decision.memory[going_on]
+        if not len(alive):
+            break
+    return [
+        Rollout(np.array(seen), np.array(did, np.float32), np.array(chosen, np.int64), bool(done), bool(done or whole))
+        for seen, did, chosen, done, whole in zip(observations, actions, sub_skills, success, ended, strict=True)
     ]
 
 

@@ -35,6 +35,8 @@ class Plan(NamedTuple):
     seed: int
     skip_nonfinite: bool = False
     """Whether an iteration whose step is not taken, for its gradient was not finite, counts as done."""
+    suite: TaskSuite | None = None
+    """Where a method that practises does so."""
 
     def tasks(self, iteration: int) -> list[str]:
         """Return the task of each slot of an iteration."""
@@ -168,7 +170,7 @@ class LocalMetaTraining:
         """Start from the plan's state."""
         self._plan, self._next = plan, plan.state.iteration
         self._learner = Learner(plan.state, plan.settings, skip_nonfinite=plan.skip_nonfinite)
-        self._worker = AdaptationWorker(plan.method, plan.shapes, plan.demonstrations, plan.seed)
+        self._worker = AdaptationWorker(plan.method, plan.shapes, plan.demonstrations, plan.seed, plan.suite)
         self._ready, self._parameters = self._learner.parameters()
 
     def iterations(self, count: int) -> Iterator[Iteration]:

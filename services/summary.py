@@ -10,9 +10,10 @@ import numpy as np
 from pydantic import BaseModel
 from rich.table import Table
 
+from dmil_core.settings import MethodConfig
 from dmil_core.statistics import Rate, mean_score, share_entropy, success_rate
 from services.checkpoints import Checkpoint
-from services.published import Published, dmil_figure
+from services.published import Published, figure_of
 from services.results import AdaptationResult, EpisodeResult, Split
 
 __all__ = [
@@ -102,6 +103,9 @@ class SubSkillUse(BaseModel):
 class Summary(BaseModel):
     """``summary.json``: what came of a run."""
 
+    method: str
+    environment_steps: int
+    """Steps that meta-training took in the environments of its tasks, for methods that practise there."""
     rows: list[Cell]
     seconds: dict[str, float]
     sub_skills: dict[Split, SubSkillUse]
@@ -115,13 +119,13 @@ class Summary(BaseModel):
     """Attempts of each task's expert that were no success and so no demonstration."""
 
 
-def cells(episodes: Sequence[EpisodeResult], best_score: int, sub_skills: int) -> list[Cell]:
+def cells(episodes: Sequence[EpisodeResult], best_score: int, method: MethodConfig) -> list[Cell]:
     """Return one cell for each split and size of support set, with Wilson intervals.
 
     Args:
         episodes: all rows.
         best_score: of an episode in which all is done; where it is more than 1, scores are given too.
-        sub_skills: K, by which the paper's figures differ.
+        method: its settings, by which the paper's figures differ.
     """
     key = attrgetter("suite", "split", "shots")
     found = []
@@ -141,7 +145,7 @@ def cells(episodes: Sequence[EpisodeResult], best_score: int, sub_skills: int) -
                 high=rate.high,
                 per_task=per_task,
                 score=_score(rows, best_score) if best_score > 1 else None,
-                paper=dmil_figure(suite, split, shots, sub_skills),
+                paper=figure_of(method, suite, split, shots),
             )
         )
     return sorted(found, key=lambda cell: (cell.suite, cell.split == "meta-testing", cell.shots))
@@ -164,11 +168,11 @@ def _score(rows: Sequence[EpisodeResult], best: int) -> Score:
 
 
 def sub_skill_use(adaptations: Sequence[AdaptationResult]) -> dict[Split, SubSkillUse]:
-    """Return the use of sub-skills in each split."""
+    """Return the use of sub-skills in each split, where there are several."""
     use: dict[Split, SubSkillUse] = {}
     for split in ("meta-training", "meta-testing"):
         rows = [row for row in adaptations if row.split == split and row.steps]
-        if not rows:
+        if not rows or len(rows[0].sub_skill_steps) == 1:
             continue
         steps = np.array([row.sub_skill_steps for row in rows])
         share = steps.sum(0) / steps.sum()
@@ -204,7 +208,9 @@ def summarise(
     """Return the summary of an evaluation whose report is to lie in `folder`."""
     config = evaluation.checkpoint.manifest.config
     return Summary(
-        rows=cells(evaluation.episodes, evaluation.best_score, config.method.sub_skills),
+        method=config.method.name,
+        environment_steps=evaluation.checkpoint.manifest.environment_steps,
+        rows=cells(evaluation.episodes, evaluation.best_score, config.method),
         seconds=seconds,
         sub_skills=sub_skill_use(evaluation.adaptations),
         protocol=evaluation.protocol,
@@ -220,7 +226,7 @@ def summarise(
 def table(summary: Summary) -> Table:
     """Lay the summary out for the terminal."""
     head, *rows = _table(summary)
-    view = Table(title=f"Success rates ({summary.protocol}; seed {summary.seed})")
+    view = Table(title=f"Success rates of {_described(summary)}")
     for column in head:
         named = column in ("suite", "split")
         view.add_column(column, justify="left" if named else "right", no_wrap=named)
@@ -237,7 +243,12 @@ def table_markdown(summary: Summary) -> str:
         cells = [cell for cell in summary.rows if cell.split == split]
         lines += ["", _row(["task", *(f"{cell.shots}-shot" for cell in cells)]), _row(["---"] * (len(cells) + 1))]
         lines += [_row([task, *(_of_task(cell, task) for cell in cells)]) for task in sorted(cells[0].per_task)]
-    return f"Protocol: {summary.protocol}; seed {summary.seed}.\n\n" + "\n".join(lines) + "\n"
+    return f"Success rates of {_described(summary)}.\n\n" + "\n".join(lines) + "\n"
+
+
+def _described(summary: Summary) -> str:
+    steps = f"; {summary.environment_steps:,} environment steps in meta-training" if summary.environment_steps else ""
+    return f"{summary.method} ({summary.protocol}; seed {summary.seed}{steps})"
 
 
 def _table(summary: Summary) -> list[list[str]]:

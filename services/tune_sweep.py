@@ -153,9 +153,10 @@ def _resumed(given: Arguments) -> SweepFolder:
 def _introduce(tracker: Tracker, sweep: SweepFolder) -> None:
     record, settings = sweep.record, sweep.record.sweep
     suites, seeds = " ".join(settings.suites), " ".join(map(str, settings.seeds))
+    methods = " ".join(dict.fromkeys(trial.config.method.name for trial in sweep.trials.values()))
     tracker.parameters({"sweep": record.name, "scale": record.size, "suites": suites, "seeds": seeds})
     tracker.parameters({"rows": ", ".join(settings.row_names), "trials": len(sweep.trials)})
-    tracker.tags({"sweep": record.name, "scale": record.size, "suite": suites, "method": "dmil", "seed": seeds})
+    tracker.tags({"sweep": record.name, "scale": record.size, "suite": suites, "method": methods, "seed": seeds})
     tracker.tags({"git_commit": record.commit, "command": record.command})
 
 

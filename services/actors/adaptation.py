@@ -11,6 +11,8 @@ from dmil_core.methods.base import MetaLearner
 from dmil_core.networks import unflatten
 from dmil_core.outer_loop import SpoiltSlot, add, group_gradient
 from services.actors.freight import Freight, pack, unpack
+from services.actors.simulation import SimulationWorker
+from services.suites.base import TaskSuite
 from services.timing import Span
 
 __all__ = ["AdaptationWorker", "BlockReport"]
@@ -34,9 +36,14 @@ class AdaptationWorker:
         shapes: Mapping[str, torch.Size],
         demonstrations: Mapping[str, Sequence[Demonstration]],
         seed: int,
+        suite: TaskSuite | None,
     ) -> None:
-        """Take what does not change during the run; demonstrations stay in shared memory."""
+        """Take what does not change during the run; demonstrations stay in shared memory.
+
+        A method that practises does so here, in environments of the suite: a slot stays one piece of pure work.
+        """
         torch.set_num_threads(1)
+        self._practise = SimulationWorker(suite).practise if suite is not None else None
         self._method, self._shapes, self._demonstrations, self._seed = method, shapes, demonstrations, seed
 
     def gradient(
@@ -62,7 +69,7 @@ class AdaptationWorker:
         began = time.perf_counter()
         own = unflatten(torch.from_numpy(unpack(parameters)), self._shapes)
         results = [
-            group_gradient(self._method, self._demonstrations, own, self._seed, iteration, tasks, slots)
+            group_gradient(self._method, self._demonstrations, own, self._seed, iteration, tasks, slots, self._practise)
             for slots in block
         ]
         gradient = add([result.gradient for result in results])

@@ -23,7 +23,7 @@ class StepReport(NamedTuple):
 
 
 class Learner:
-    """Holds the parameters and Adam's moments."""
+    """Holds the parameters and what else its steps depend on."""
 
     def __init__(self, state: OuterState, training: TrainingConfig, *, skip_nonfinite: bool = False) -> None:
         """Continue from `state`.
@@ -35,7 +35,7 @@ class Learner:
         """
         torch.set_num_threads(1)
         self._skip = skip_nonfinite
-        self._step = OuterStep(state, training.learning_rate, training.gradient_clip)
+        self._step = OuterStep(state, training)
 
     def parameters(self) -> tuple[float, Freight]:
         """Return the time on this machine's clock, and the current parameters, flat."""

@@ -10,10 +10,10 @@ from jaxtyping import Float32
 from dmil_core.configs import DemonstrationConfig, EvaluationConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import piece_of_work
-from dmil_core.methods.base import Method
+from dmil_core.methods.base import Method, Policy, Rollout
 from dmil_core.networks import unflatten
 from dmil_core.seeding import stream_seed
-from services.rollouts import Trial, TrialOutcome, demonstrate, try_out
+from services.rollouts import Trial, TrialOutcome, demonstrate, episodes_beside, practise, try_out
 from services.suites.base import Attempt, Environment, TaskSuite, build_env
 from services.verification import VerificationRow, verify
 
@@ -66,6 +66,11 @@ class SimulationWorker:
         """
         with piece_of_work(f"task {task}, seeds {seeds[0]} to {seeds[-1]}", task=task, seed=seeds[0]):
             return verify(self._suite, task, seeds, noise)
+
+    def practise(self, policy: Policy, task: str, seed: int, steps: int) -> list[Rollout]:
+        """Let a policy act in a task for so many steps, see `services.rollouts.practise`."""
+        envs = self._environments(task, episodes_beside(steps, self._suite.horizon))
+        return practise(policy, envs, seed, steps, self._suite.horizon)
 
     def try_out(
         self,

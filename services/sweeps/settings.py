@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from dmil_core.configs import EvaluationConfig, ExperimentConfig, SuiteConfig, SuiteName, preset_of
 from dmil_core.seeding import stream
 from dmil_core.settings import Count, NotNegative, Seed, Settings
-from services.command_line import ConfigError, checked
+from services.command_line import ConfigError, checked, method_named
 from services.results import Split
 from services.settings_files import merged
 from services.suites.registry import open_suite
@@ -200,7 +200,8 @@ def planned(sweep: Sweep, size: Size) -> list[PlannedTrial]:
     layers = {"shots, episodes": {"evaluation": evaluation}, "settings": sweep.settings}
     trials = []
     for suite, (variant, own), seed in itertools.product(sweep.suites, variants.items(), sweep.seeds):
-        settings = preset_of(suite, size).model_dump()
+        method = method_named(own if "name" in own.get("method", {}) else sweep.settings)
+        settings = preset_of(suite, size, method).model_dump()
         for origin, overrides in {**layers, f"variants.{variant}": own, "seeds": {"seed": seed}}.items():
             settings = merged(settings, overrides, origin)
         config = checked(settings, f"{variant} on {suite}: ")

@@ -169,7 +169,7 @@ def _record(
 ) -> float:
     """Record the rates of an evaluation, and return what a search would go by."""
     rows = read_rows(folder / "episodes.jsonl", EpisodeResult)
-    found = rates(cells(rows, experiment.suite.best_score, experiment.config.method.sub_skills), {})
+    found = rates(cells(rows, experiment.suite.best_score, experiment.config.method), {})
     iteration = checkpoint.manifest.iteration
     tracker.metrics(iteration, {f"{prefix}/{name}" if prefix else name: value for name, value in found.items()})
     return float(np.mean([value for name, value in found.items() if name.startswith(f"{metric}/meta-testing/")]))

@@ -8,12 +8,12 @@ from pydantic import ValidationError
 from dmil_core.configs import (
     PRESETS,
     DemonstrationConfig,
-    DmilConfig,
     EvaluationConfig,
     ExperimentConfig,
     SuiteConfig,
     TrainingConfig,
 )
+from dmil_core.dmil_config import DmilConfig
 
 NAN, INF = float("nan"), float("inf")
 
@@ -42,7 +42,7 @@ def test_presets_survive_json(preset: ExperimentConfig) -> None:
 @pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
 def test_presets_leave_enough_demonstrations_for_four_disjoint_sets(preset: ExperimentConfig) -> None:
     demonstrations = preset.demonstrations
-    assert demonstrations.per_task - demonstrations.held_out >= 4 * preset.method.trajectories
+    assert demonstrations.per_task - demonstrations.held_out >= 4 * preset.method.model_dump()["trajectories"]
 
 
 @pytest.mark.parametrize(

@@ -22,10 +22,18 @@ def training(config: ExperimentConfig, slots: int, group: int) -> ExperimentConf
 def plan_of(experiment: Experiment, data) -> Plan:
     config = experiment.config
     sets = experiment.training_sets(data)
-    method = experiment.method(sets)
+    method = experiment.meta_learner(sets)
     initial = experiment.initial_parameters(method)
     shapes = {name: tensor.shape for name, tensor in initial.items()}
-    return Plan(method, shapes, sets, OuterState.start(flatten(initial).numpy()), config.training, config.seed)
+    return Plan(
+        method,
+        shapes,
+        sets,
+        OuterState.start(flatten(initial).numpy()),
+        config.training,
+        config.seed,
+        suite=experiment.suite,
+    )
 
 
 class Course(NamedTuple):

@@ -12,7 +12,7 @@ import pytest
 import safetensors.numpy
 import torch
 
-from dmil_core.configs import ExperimentConfig
+from dmil_core.configs import ExperimentConfig, TrainingConfig
 from dmil_core.networks import unflatten
 from dmil_core.outer_loop import OuterState, OuterStep, add
 from services.checkpoints import Checkpoint, CheckpointError, Checkpoints, Manifest
@@ -28,7 +28,7 @@ def gradients(iteration: int) -> list[np.ndarray]:
 
 
 def advance(state: OuterState, iterations: int) -> OuterState:
-    step = OuterStep(state, learning_rate=1e-2, gradient_clip=1.0)
+    step = OuterStep(state, TrainingConfig(learning_rate=1e-2, gradient_clip=1.0))
     for iteration in range(state.iteration, state.iteration + iterations):
         step(add(gradients(iteration)))
     return step.state

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,7 +13,7 @@ from services.command_line import PROGRAMS, ConfigError, config_from, parse
 from services.meta_train import Arguments, run
 
 
-def settings(*flags: str, preset: str = "ml10-smoke", file: Path | None = None):
+def settings(*flags: str, preset: str = "ml10-smoke", file: Path | None = None) -> Any:
     return parse(Arguments, "", flags, Arguments(config_from(preset, file))).experiment
 
 
@@ -28,6 +29,7 @@ def yaml_file(tmp_path: Path):
 
 def test_the_paper_preset_is_table_9_to_the_letter():
     paper = PRESETS["ml10-paper"]
+    method: Any
     method, training = paper.method, paper.training
     assert (method.inner_learning_rate, training.learning_rate) == (5e-4, 1e-4)
     assert (method.inner_steps, method.trajectories, method.continuity_weight) == (3, 16, 0.1)
@@ -40,7 +42,7 @@ def test_the_paper_preset_is_table_9_to_the_letter():
 def test_a_file_overrides_the_preset_and_a_flag_overrides_the_file(yaml_file):
     file = yaml_file("seed: 3\nmethod: {sub_skills: 5, window: null}\nsuite: {train_tasks: [reach, push]}\n")
     found = settings("--method.sub-skills", "7", "--evaluation.shots", "2", file=file)
-    preset = PRESETS["ml10-smoke"]
+    preset: Any = PRESETS["ml10-smoke"]
     assert (found.seed, found.method.sub_skills, found.method.window) == (3, 7, None)
     assert found.suite.train_tasks == ("reach", "push")
     assert found.evaluation.shots == (2,)

@@ -17,6 +17,7 @@ from ray.cluster_utils import Cluster as Nodes
 from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import WorkError
 from dmil_core.methods.dmil import Dmil
+from dmil_core.methods.registry import OURS
 from services import meta_train, reproduce
 from services.actors.simulation import SimulationWorker
 from services.checkpoints import Checkpoints
@@ -224,7 +225,7 @@ class FailingDmil(Dmil):
 def test_an_error_is_told_with_the_command_that_repeats_it(
     train, workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    monkeypatch.setattr("services.experiment.Dmil", FailingDmil)
+    monkeypatch.setitem(OURS, "dmil", FailingDmil)
     monkeypatch.setattr(FailingDmil, "calls", 0)
     arguments = ["--preset", "ml10-smoke", "--runner", "local", "--name", "run"]
     assert exit_code(meta_train.run, arguments) == 1

@@ -4,7 +4,6 @@ Both skills are the same in every task. Which comes first, and on which line x +
 has to see from the support set.
 """
 
-import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -72,10 +71,8 @@ def training_sets(tasks: int = 8, episodes: int = 16) -> dict[str, Sequence[Demo
 def practise(policy: Policy, task: str, seed: int, steps: int) -> list[Rollout]:
     """Let a policy act in a task, `steps` in all; it succeeds where at the end it stands where the expert would."""
     number, rollouts, left = int(task.removeprefix("task-")), [], steps
-    for episode in itertools.count():
-        if left <= 0:
-            return rollouts
-        place = expert = _start(stream(seed, "start", episode))
+    while left > 0:
+        place = expert = _start(stream(seed, "start", len(rollouts)))
         memory, places, actions, chosen = policy.start(1), [place], [], []
         for _ in range(min(STEPS, left)):
             decision = policy.act(place[None].astype(np.float32), memory)
@@ -92,6 +89,7 @@ def practise(policy: Policy, task: str, seed: int, steps: int) -> list[Rollout]:
         rollouts.append(
             Rollout(np.array(places, np.float32), np.array(actions, np.float32), np.array(chosen), success, ended)
         )
+    return rollouts
 
 
 def meta_trained(

@@ -44,17 +44,17 @@ def test_each_sweep_has_trials_at_every_size(name: str, size) -> None:
 
 def test_rows_are_what_the_paper_varies() -> None:
     trials = {name: planned(sweep_of(name).at("paper"), "paper") for name in NAMES}
-    methods = {name: {trial.variant: trial.config.method for trial in trials[name]} for name in NAMES}
-    assert {row: method.adapted for row, method in methods["bilevel"].items()} == {
+    methods = {name: {trial.variant: trial.config.method.model_dump() for trial in trials[name]} for name in NAMES}
+    assert {row: method["adapted"] for row, method in methods["bilevel"].items()} == {
         "DMIL": "both", "DMIL-High": "high", "DMIL-Low": "low",
     }  # fmt: skip
-    assert {method.sub_skills for method in methods["bilevel"].values()} == {3}
-    assert {row: method.em for row, method in methods["em"].items()} == {"DMIL": "hard", "DMIL_soft": "soft"}
-    weights = {row: method.continuity_weight for row, method in methods["continuity"].items()}
+    assert {method["sub_skills"] for method in methods["bilevel"].values()} == {3}
+    assert {row: method["em"] for row, method in methods["em"].items()} == {"DMIL": "hard", "DMIL_soft": "soft"}
+    weights = {row: method["continuity_weight"] for row, method in methods["continuity"].items()}
     assert weights == {"DMIL_nc": 0.0, "λ = 0.01": 0.01, "DMIL": 0.1, "λ = 1": 1.0}
-    assert {method.sub_skills for method in methods["continuity"].values()} == {10}
-    assert [method.sub_skills for method in methods["sub_skills"].values()] == [2, 3, 5, 8, 10]
-    assert [method.sub_skills for method in methods["kitchen_k"].values()] == [2, 4, 8]
+    assert {method["sub_skills"] for method in methods["continuity"].values()} == {10}
+    assert [method["sub_skills"] for method in methods["sub_skills"].values()] == [2, 3, 5, 8, 10]
+    assert [method["sub_skills"] for method in methods["kitchen_k"].values()] == [2, 4, 8]
     steps = {row: own.fine_tuning_steps for row, own in trials["finetune_steps"][0].evaluations.items()}
     assert steps == {row: int(row) for row in ("10", "30", "50", "100", "300", "500")}
     assert {own.learning_rate for own in trials["finetune_steps"][0].evaluations.values()} == {0.01}
@@ -100,7 +100,7 @@ def test_a_size_has_its_own_budget() -> None:
     (trial,) = planned(sweep.at("quick"), "quick")
     assert (trial.suite, trial.seed, trial.config.seed) == ("ml45", 3, 3)
     assert (trial.config.training.iterations, trial.config.training.tasks_per_iteration) == (7, 2)
-    assert trial.config.method.sub_skills == 4
+    assert trial.config.method.model_dump()["sub_skills"] == 4
     trials = planned(sweep.at("quick", ["ml10"], [5, 6]), "quick")
     assert [(trial.suite, trial.seed) for trial in trials] == [("ml10", 5), ("ml10", 6)]
     assert planned(sweep.at("paper"), "paper")[0].config.training.iterations == 2000

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dmil_core.settings import sub_skills_of
 from services import report
 from services.results import AdaptationResult, EpisodeResult, write_rows
 from services.sweeps.folders import SweepError, SweepFolder, SweepRecord, TrialResult
@@ -231,7 +232,7 @@ def test_a_search_is_ranked_and_its_best_is_a_file_of_settings(tmp_path: Path) -
     tables = write_tables(sweep)
     assert [sample.sample for sample in tables.samples] == ["sample 2", "sample 1", "sample 0"]
     best = config_from("ml10-quick", sweep.path / "tables" / "best.yaml")
-    assert best.method.sub_skills == sweep.trials["ml10-sample-2-seed-0"].config.method.sub_skills
+    assert sub_skills_of(best.method) == sub_skills_of(sweep.trials["ml10-sample-2-seed-0"].config.method)
     text = (sweep.path / "tables" / "table.md").read_text()
     assert text.index("sample 2") < text.index("sample 1") < text.index("sample 0")
 
