@@ -112,8 +112,12 @@ class Experiment:
             store: where its demonstrations are, or will be.
 
         Raises:
-            UserError: for a suite, a task or a source of demonstrations that there is not.
+            UserError: for a suite, a task or a source of demonstrations that there is not, or iterations of a method
+                without meta-training.
         """
+        name, iterations = config.method.name, config.training.iterations
+        if iterations and not issubclass(method_type(name), MetaLearner):
+            raise UserError(f"training.iterations: got {iterations}; wanted 0: {name} has no meta-training")
         self.config = config
         self.suite: TaskSuite = open_suite(config.suite)
         self.store = store
@@ -156,18 +160,10 @@ class Experiment:
         return method_type(settings.name).prepared(settings, self.suite.action_dim, demonstrations)
 
     def meta_learner(self, training_sets: Mapping[str, Sequence[Demonstration]]) -> MetaLearner[Any]:
-        """Return the method, as one that is meta-trained.
-
-        Raises:
-            UserError: if it is none.
-        """
+        """Return the method, as one that is meta-trained."""
         method = self.method(training_sets)
-        if isinstance(method, MetaLearner):
-            return method
-        raise UserError(
-            f"training.iterations: got {self.config.training.iterations}; wanted 0: {self.config.method.name} has no "
-            "meta-training"
-        )
+        assert isinstance(method, MetaLearner)
+        return method
 
     def initial_parameters(self, method: Method) -> Parameters:
         """Draw the parameters that meta-training starts from."""
@@ -205,7 +201,7 @@ class Experiment:
         """
         settings = self.config.training
         sets = self.training_sets(data)
-        method = self.meta_learner(sets) if settings.iterations else self.method(sets)
+        method = self.method(sets)
         initial = self.initial_parameters(method)
         shapes = {name: tensor.shape for name, tensor in initial.items()}
         digests = {task: dataset.digest for task, dataset in data.items()}

@@ -8,8 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dmil_core.configs import TrainingConfig
 from dmil_core.meta_gradient import tree_sum
-from dmil_core.outer_loop import BLOCKS_PER_WORKER, add, blocks
+from dmil_core.outer_loop import BLOCKS_PER_WORKER, OuterState, OuterStep, add, blocks
 
 
 def gradients_of(seed: int, count: int) -> list[np.ndarray]:
@@ -69,3 +70,31 @@ def test_adding_leaves_shared_memory_as_it_is(count: int):
         gradient.flags.writeable = False
     add(gradients)
     assert all(map(np.array_equal, gradients, gradients_of(1, count)))
+
+
+def test_the_way_to_the_mean_is_the_mean_of_the_ways():
+    start = OuterState(3, *(gradients_of(seed, 1)[0] for seed in (1, 2, 3)))
+    ways = gradients_of(4, 3)
+    training = TrainingConfig(outer_step="average", learning_rate=0.5, tasks_per_iteration=3)
+    step = OuterStep(start, training)
+    total = add(ways)
+    assert step(total) == pytest.approx(float(np.linalg.norm(total / 3)), rel=1e-5)
+    np.testing.assert_allclose(step.state.parameters, start.parameters - 0.5 * np.mean(ways, axis=0), rtol=1e-3)
+    assert step.state.iteration == 4
+    assert np.array_equal(step.state.first_moment, start.first_moment)
+    assert np.isnan(step(np.full_like(total, np.nan)))
+    assert step.state.iteration == 4
+
+
+def test_a_step_of_adam_is_that_of_torch():
+    start = OuterState.start(gradients_of(1, 1)[0])
+    training = TrainingConfig(learning_rate=0.1, gradient_clip=1.0)
+    step = OuterStep(start, training)
+    twin = torch.nn.Parameter(torch.tensor(start.parameters))
+    adam = torch.optim.Adam([twin], lr=0.1)
+    for gradient in gradients_of(2, 5):
+        step(gradient)
+        twin.grad = torch.tensor(gradient)
+        torch.nn.utils.clip_grad_norm_([twin], 1.0)
+        adam.step()
+    np.testing.assert_allclose(step.state.parameters, twin.detach().numpy(), rtol=1e-5)
