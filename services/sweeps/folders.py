@@ -67,6 +67,8 @@ class TrialResult(_Record):
     """Folder of each evaluation's rows, in the folder of all runs, by the table's row."""
     seconds: dict[str, float] = {}
     iteration: int = 0
+    environment_steps: int = 0
+    """That its meta-training took."""
     held_out: float | None = None
     """What a search goes by: the mean over shots on the held-out tasks."""
 

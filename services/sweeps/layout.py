@@ -36,8 +36,8 @@ def _grid(tables: Tables) -> dict[str, dict[str, Cell]]:
     return grid
 
 
-def _lines(found: Cell | None, digits: int) -> list[str]:
-    """Return a cell's lines: none if it was not run."""
+def _figures(found: Cell | None, digits: int) -> list[str]:
+    """Return a cell's mean and the paper's, a line each: none if it was not run."""
     if found is None:
         return []
     interval = "" if found.low is None else f" ({found.low:.{digits}f} to {found.high:.{digits}f})"
@@ -45,7 +45,18 @@ def _lines(found: Cell | None, digits: int) -> list[str]:
     if found.paper is not None:
         mark = " outside" if found.outside else ""
         lines.append(f"paper {found.paper.in_words(digits)}: {found.difference:+.{digits}f}{mark}")
-    lines.append(f"{found.sub_skills_in_use:.1f} sub-skills in use")
+    return lines
+
+
+def _lines(found: Cell | None, digits: int) -> list[str]:
+    """Return a cell's figures, and what they come from."""
+    if found is None:
+        return []
+    lines = _figures(found, digits)
+    if found.environment_steps:
+        lines.append(f"{found.environment_steps:,} environment steps")
+    if found.sub_skills_in_use is not None:
+        lines.append(f"{found.sub_skills_in_use:.1f} sub-skills in use")
     plural = "seed" if len(found.seeds) == 1 else "seeds"
     return [*lines, f"{len(found.seeds)} {plural}, {found.episodes} episodes"]
 
@@ -149,7 +160,8 @@ def _markdown(tables: Tables) -> str:
         lines += _rows(["row", "where", "interquartile mean", "sub-skills in use", "interval"])
         for found in tables.cells:
             where = f"{found.suite}, {found.split}, {found.shots}-shot"
-            middle, in_use = f"{found.interquartile_mean:.{digits}f}", f"{found.sub_skills_in_use:.1f}"
+            middle = f"{found.interquartile_mean:.{digits}f}"
+            in_use = "" if found.sub_skills_in_use is None else f"{found.sub_skills_in_use:.1f}"
             lines.append(_row([found.row, where, middle, in_use, found.interval]))
     if tables.differences:
         lines += ["", "On the same seeds and episodes:", ""]
@@ -183,7 +195,7 @@ def _latex(tables: Tables) -> str:
     head = [stacked(column.split(", ")) for column in tables.columns]
     lines += [" & ".join(["", *head]) + r" \\", r"\midrule"]
     for row in tables.rows:
-        own = [stacked(_lines(grid[row].get(column), digits)[:-2]) for column in tables.columns]
+        own = [stacked(_figures(grid[row].get(column), digits)) for column in tables.columns]
         lines.append(" & ".join([row.translate(_TEX), *own]) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
 

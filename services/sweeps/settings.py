@@ -46,6 +46,8 @@ class Scale(Settings):
     """In place of the search's."""
     settings: Overrides = Field(default_factory=dict)
     """Beside the sweep's."""
+    variants: dict[Name, Overrides] = Field(default_factory=dict)
+    """Settings of some variants, beside their own."""
 
 
 class Range(Settings):
@@ -129,6 +131,9 @@ class Sweep(Settings):
     def _one_kind(self) -> "Sweep":
         if bool(self.variants) == bool(self.search):
             raise ValueError("variants, search: got both or neither; wanted one of them")
+        for size, scale in self.scales.items():
+            if unknown := sorted(set(scale.variants) - set(self.variants)):
+                raise ValueError(f"scales.{size}.variants: got {unknown[0]!r}; wanted of {', '.join(self.variants)}")
         if self.baseline is not None and self.baseline not in self.row_names:
             raise ValueError(f"baseline: got {self.baseline!r}; wanted one of {', '.join(self.row_names)}")
         return self
@@ -141,6 +146,7 @@ class Sweep(Settings):
         """
         scale = self.scales.get(size, Scale())
         changes: dict[str, Any] = {
+            "variants": {name: _laid_over(own, scale.variants.get(name, {})) for name, own in self.variants.items()},
             "suites": tuple(suites) or scale.suites or self.suites,
             "seeds": tuple(seeds) or scale.seeds or self.seeds,
             "settings": _laid_over(self.settings, scale.settings),

@@ -6,7 +6,7 @@ spread. Rows are compared on the same seeds and the same episodes.
 """
 
 import itertools
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
 from typing import Literal, NamedTuple
 
@@ -57,8 +57,11 @@ class Cell(BaseModel):
     interquartile_mean: float
     """Over the rates of each task and seed."""
     interval: Literal["bootstrap over seeds and episodes", "Wilson", "Student"]
-    sub_skills_in_use: float
-    """Those with over a tenth of a task's states after adaptation, on average over adaptations."""
+    sub_skills_in_use: float | None
+    """Those with over a tenth of a task's states after adaptation, on average over adaptations; none of a method
+    without sub-skills."""
+    environment_steps: int
+    """That meta-training took, of all seeds together."""
     paper: Published | None
     difference: float | None
     """From the paper's figure."""
@@ -157,7 +160,7 @@ def _other_episodes(sweep: SweepFolder, row: str) -> SweepError:
     )
 
 
-def _in_use(sweep: SweepFolder) -> dict[Place, float]:
+def _in_use(sweep: SweepFolder) -> dict[Place, float | None]:
     """Return how many sub-skills are in use per task in all finished trials."""
     found: dict[Place, list[AdaptationResult]] = defaultdict(list)
     for name, trial in sweep.trials.items():
@@ -165,7 +168,18 @@ def _in_use(sweep: SweepFolder) -> dict[Place, float]:
         for row, folder in (result.evaluated if result else {}).items():
             for adaptation in read_rows(sweep.runs / folder / "adaptations.jsonl", AdaptationResult):
                 found[Place(row, trial.suite, adaptation.split, adaptation.shots)].append(adaptation)
-    return {place: sub_skill_use(rows)[place.split].in_use_per_task for place, rows in found.items()}
+    use = {place: sub_skill_use(rows).get(place.split) for place, rows in found.items()}
+    return {place: own and own.in_use_per_task for place, own in use.items()}
+
+
+def _environment_steps(sweep: SweepFolder) -> Counter[tuple[str, str]]:
+    """Return the environment steps of all finished trials, by row and suite."""
+    found: Counter[tuple[str, str]] = Counter()
+    for name, trial in sweep.trials.items():
+        result = sweep.result(name)
+        for row in result.evaluated if result else ():
+            found[row, trial.suite] += result.environment_steps if result else 0
+    return found
 
 
 def _grouped(rows: Iterable[EpisodeResult]) -> dict[tuple[Split, int], list[EpisodeResult]]:
@@ -175,7 +189,14 @@ def _grouped(rows: Iterable[EpisodeResult]) -> dict[tuple[Split, int], list[Epis
     return groups
 
 
-def cell(place: Place, outcomes: Outcomes, in_use: float, table: str | None, metric: Metric) -> Cell:
+def cell(
+    place: Place,
+    outcomes: Outcomes,
+    in_use: float | None,
+    table: str | None,
+    metric: Metric,
+    environment_steps: int = 0,
+) -> Cell:
     """Return the mean of some outcomes with its interval, and the paper's figure."""
     seeds = sorted(outcomes)
     values = np.stack([outcomes[seed] for seed in seeds])
@@ -205,6 +226,7 @@ def cell(place: Place, outcomes: Outcomes, in_use: float, table: str | None, met
         interquartile_mean=interquartile_mean(values.mean(2).ravel().tolist()),
         interval=kind,
         sub_skills_in_use=in_use,
+        environment_steps=environment_steps,
         paper=paper,
         difference=None if paper is None else mean - paper.value,
         outside=outside,
@@ -239,7 +261,11 @@ def tables_of(sweep: SweepFolder) -> Tables:
         for place in places
         if place.row != baseline and place in outcomes and place._replace(row=baseline) in outcomes
     ]
-    in_use, results = _in_use(sweep), {name: sweep.result(name) for name in sweep.trials}
+    in_use, practised, results = (
+        _in_use(sweep),
+        _environment_steps(sweep),
+        {name: sweep.result(name) for name in sweep.trials},
+    )
     statuses = [result.status if result else "not run" for result in results.values()]
     return Tables(
         name=record.name,
@@ -254,7 +280,14 @@ def tables_of(sweep: SweepFolder) -> Tables:
         rows=list(settings.suites) if settings.rows == "suites" else rows,
         columns=list(dict.fromkeys(column_of(place, settings.rows) for place in places)),
         cells=[
-            cell(place, outcomes[place], in_use[place], settings.paper, settings.metric)
+            cell(
+                place,
+                outcomes[place],
+                in_use[place],
+                settings.paper,
+                settings.metric,
+                practised[place.row, place.suite],
+            )
             for place in places
             if place in outcomes
         ],

@@ -146,6 +146,7 @@ def _run(sweep: SweepFolder, trial: PlannedTrial, store: DemoStore, tracker: Tra
         evaluated={row: str(folder.relative_to(sweep.runs)) for row, folder in folders.items()},
         seconds=clock.seconds,
         iteration=checkpoint.manifest.iteration,
+        environment_steps=checkpoint.manifest.environment_steps,
         held_out=float(np.mean(held_out)),
     )
 

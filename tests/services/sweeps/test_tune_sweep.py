@@ -22,7 +22,7 @@ from services.sweeps.folders import SweepFolder
 from services.tracking import Tracker
 
 ROWS = {
-    "bilevel": ["DMIL", "DMIL-High", "DMIL-Low"],
+    "bilevel": ["DMIL", "DMIL-High", "DMIL-Low", "OptionGAIL"],
     "continuity": ["DMIL_nc", "λ = 0.01", "DMIL", "λ = 1"],
     "em": ["DMIL", "DMIL_soft"],
     "finetune_steps": ["10", "30", "50", "100", "300", "500"],
