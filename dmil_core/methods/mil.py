@@ -11,8 +11,8 @@ What the appendix leaves open, and what is done here:
 
 - **Copying.** The support states are asked for with the support itself in the encoder, where each answer could be read
   off. Hiding step t from the decoder alone is no help: self-attention has carried a_t into all other tokens. So the
-  steps at even places are predicted from those at odd places, and the other way round: what is asked for never enters
-  the encoder, and no path leads from a_t to its prediction. It is two passes of half the size. A learned first token
+  every other step is predicted from the remaining ones, and the other way round: what is asked for never enters the
+  encoder, and no path leads from a_t to its prediction. It is two passes of half the size. A learned first token
   is there always, so that a support of one step can be learned from: it is asked for with nothing else to go by.
 - **Pairs.** Table 10's batch of 512 state-action pairs bounds both losses: the inner one asks for all steps of the
   support, or so many evenly spaced ones, and the outer one for as many pairs, drawn evenly from all steps of the task's
@@ -24,107 +24,30 @@ What the appendix leaves open, and what is done here:
 - **Feed-forward units** are 2,048, as is usual with d_model 512; with it the model has 18.9 M parameters. Positions are
   encoded by sines. Departures from the original transformer are told in `transformer`.
 - **Dropout** applies in the outer loss only: the inner gradient should be of the model that acts.
-- **Inner loop.** One step, inner gradients clipped number by number at ±10, and second order, as in MIL. α is 0.01, the
-  upper end of MIL's 0.001 to 0.01. MIL's learned temporal loss is for videos without actions: here they are given.
+- **Inner loop.** One step, inner gradients clipped number by number at ±10, and second order, as in MIL. α is 0.001,
+  the lower end of MIL's 0.001 to 0.01: with 512 units, 0.01 takes an untrained model's loss up. MIL's temporal loss is
+  for videos without actions: here they are given.
 - **Outer learning rate.** MIL's 1e-3 was for convolutions of 4 layers; with 512 units and no warm-up it is Table 9's
   1e-4 here, and 1e-3 for the small model of the size quick.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int, Int64
-from torch import Tensor
+from jaxtyping import Float32, Int64
 
 from dmil_core.demonstrations import Demonstration, DemonstrationError, Standardisation
-from dmil_core.losses import squared_errors
 from dmil_core.meta_gradient import TaskGradient
 from dmil_core.methods import transformer
 from dmil_core.methods.base import Decision, FineTuning, Standardised, SubSkillUse, no_sub_skills
-from dmil_core.methods.transformer import Dropout, Sizes, cached, decode, dropout, encode, no_dropout, position_encoding
-from dmil_core.networks import Parameters, flatten
-from dmil_core.settings import MethodConfig, Positive, Probability, Size
+from dmil_core.methods.mil_config import MilConfig
+from dmil_core.methods.mil_learning import Pairs, Support, adapted, outer_gradient
+from dmil_core.methods.transformer import Cache, Sizes, cached, decode, encode
+from dmil_core.networks import Parameters
 
-__all__ = [
-    "Mil",
-    "MilBatch",
-    "MilConfig",
-    "MilPolicy",
-    "Pairs",
-    "Support",
-    "adapted",
-    "inner_loss",
-    "outer_gradient",
-    "outer_loss",
-]
-
-
-class MilConfig(MethodConfig):
-    """Meta imitation learning with a transformer."""
-
-    name: Literal["mil"] = "mil"
-    """The method."""
-    layers: Size = 3
-    """Layers of the encoder, and as many of the decoder (Table 10)."""
-    heads: Size = 8
-    """Heads of each attention (Table 10)."""
-    units: Size = 512
-    """Units of each token, d_model (Table 10)."""
-    key_units: Size = 64
-    """Of each head's keys and queries, d_k (Table 10)."""
-    value_units: Size = 64
-    """Of each head's values, d_v (Table 10)."""
-    feed_forward_units: Size = 2048
-    """Hidden units of each layer; the paper names none."""
-    positions: Size = 250
-    """Places in a demonstration (Table 10); a longer one is thinned out to so many steps."""
-    dropout: Probability = 0.1
-    """In the outer loss (Table 10)."""
-    batch_pairs: Size = 512
-    """State-action pairs that each of the two losses asks for at most (Table 10)."""
-    shots: Size = 3
-    """Most demonstrations in a support set: meta-training draws from one to so many."""
-    inner_learning_rate: Positive = 1e-2
-    """α; the paper names none, Finn et al. 2017 have 0.001 to 0.01."""
-    inner_steps: Size = 1
-    """Steps of the inner loop (Finn et al. 2017)."""
-    inner_clip: Positive | None = 10.0
-    """Clip each number of the inner gradients to ± this (Finn et al. 2017: 10 or 20)."""
-    order: Literal["first", "second"] = "second"
-    """Of the meta-gradient: exact, or taken at the adapted parameters."""
-
-    sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        "paper": {"evaluation": {"fine_tuning_steps": 1, "learning_rate": 1e-2}},
-        "quick": {
-            "method": {
-                "layers": 2,
-                "heads": 4,
-                "units": 64,
-                "key_units": 16,
-                "value_units": 16,
-                "feed_forward_units": 256,
-                "batch_pairs": 256,
-                "order": "first",
-            },
-            "evaluation": {"fine_tuning_steps": 1, "learning_rate": 1e-2},
-        },
-        "smoke": {
-            "method": {
-                "layers": 1,
-                "heads": 2,
-                "units": 16,
-                "key_units": 8,
-                "value_units": 8,
-                "feed_forward_units": 32,
-                "positions": 50,
-                "batch_pairs": 64,
-            },
-            "evaluation": {"fine_tuning_steps": 1, "learning_rate": 1e-2},
-        },
-    }
+__all__ = ["Mil", "MilBatch", "MilConfig", "MilPolicy"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,141 +68,12 @@ class MilBatch:
         return tuple(demonstration.id for demonstration in self.support) + self.query_ids
 
 
-class Pairs(NamedTuple):
-    """State-action pairs of the query set."""
-
-    states: Float[Tensor, "pairs obs_dim"]
-    actions: Float[Tensor, "pairs action_dim"]
-
-
-class Support(NamedTuple):
-    """The steps of the support demonstrations, one after the other."""
-
-    states: Float[Tensor, "steps obs_dim"]
-    actions: Float[Tensor, "steps action_dim"]
-    positions: Float[Tensor, "steps units"]
-    """The encoding of each step's place."""
-    demonstrations: Int[Tensor, " steps"]
-    """Which one each step belongs to."""
-
-    @classmethod
-    def of(
-        cls, demonstrations: Sequence[Demonstration], standardise: Standardisation, positions: int, units: int
-    ) -> "Support":
-        """Copy demonstrations into fresh tensors, at most `positions` evenly spaced steps of each."""
-        places = [_evenly(len(demonstration), positions) for demonstration in demonstrations]
-        counts = [len(kept) for kept in places]
-        observations, actions = (
-            np.concatenate([values[kept] for values, kept in zip(arrays, places, strict=True)])
-            for arrays in ([one.observations for one in demonstrations], [one.actions for one in demonstrations])
-        )
-        return cls(
-            torch.from_numpy(standardise(observations)),
-            torch.from_numpy(actions),
-            position_encoding(torch.cat([torch.arange(count) for count in counts]), units),
-            torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts)),
-        )
-
-    def only(self, steps: Int[Tensor, " kept"]) -> "Support":
-        """Return some of the steps, each with its own place."""
-        return Support(*(values[steps] for values in self))
-
-
-def inner_loss(parameters: Parameters, support: Support, config: MilConfig) -> Float[Tensor, ""]:
-    """Return the mean squared error at the support's steps, each half predicted with the other half in the encoder."""
-    steps = torch.arange(len(support.states))
-    asked = torch.from_numpy(_evenly(len(steps), config.batch_pairs))
-    total = support.states.new_zeros(())
-    for half in (0, 1):
-        queries = asked[asked % 2 == half]
-        if len(queries):
-            context = support.only(steps[steps % 2 != half])
-            predictions = _predictions(parameters, context, support.states[queries], config, no_dropout)
-            total = total + squared_errors(predictions, support.actions[queries]).sum()
-    return total / len(asked)
-
-
-def outer_loss(
-    parameters: Parameters, support: Support, query: Pairs, config: MilConfig, drop: Dropout
-) -> Float[Tensor, ""]:
-    """Return the mean squared error at the query pairs, with the whole support in the encoder."""
-    predictions = _predictions(parameters, support, query.states, config, drop)
-    return squared_errors(predictions, query.actions).mean()
-
-
-class Adapted(NamedTuple):
-    """Where the inner loop ends, and how it began."""
-
-    parameters: Parameters
-    loss: float | None
-    """The inner loss before the first step, if there was any."""
-    clipped: float
-    """The part of the numbers in the inner gradients that were clipped."""
-
-
-def adapted(parameters: Parameters, support: Support, config: MilConfig, tuning: FineTuning, *, keep: bool) -> Adapted:
-    """Take steps down the inner loss.
-
-    Args:
-        parameters: where to begin.
-        support: the steps to learn from.
-        config: of the method.
-        tuning: how many steps, and how long.
-        keep: keep the graph from `parameters`, which then must ask for a gradient; else the result is a leaf.
-    """
-    fast, first, clipped = dict(parameters), None, 0
-    for _ in range(tuning.steps):
-        if not keep:
-            fast = _leaves(fast)
-        with torch.enable_grad():
-            loss = inner_loss(fast, support, config)
-            gradients = torch.autograd.grad(loss, tuple(fast.values()), create_graph=keep)
-            if config.inner_clip is not None:
-                limit = config.inner_clip
-                clipped += sum(int((gradient.detach().abs() > limit).sum()) for gradient in gradients)
-                gradients = [gradient.clamp(-limit, limit) for gradient in gradients]
-            fast = {
-                name: tensor - tuning.learning_rate * gradient
-                for (name, tensor), gradient in zip(fast.items(), gradients, strict=True)
-            }
-        first = loss.item() if first is None else first
-    numbers = max(1, tuning.steps * sum(tensor.numel() for tensor in parameters.values()))
-    return Adapted(fast if keep else _leaves(fast), first, clipped / numbers)
-
-
-def outer_gradient(
-    parameters: Parameters, support: Support, query: Pairs, config: MilConfig, seed: int
-) -> TaskGradient:
-    """Return ∇_θ L_outer(θ') of one task, exact or, with ``config.order == "first"``, taken at θ'.
-
-    The metrics tell the outer loss with and without the inner loop, under the same dropout.
-    """
-    start = _leaves(parameters)
-    second = config.order == "second"
-    tuning = FineTuning(config.inner_steps, config.inner_learning_rate)
-    end = adapted(start, support, config, tuning, keep=second)
-    with torch.enable_grad():
-        loss = outer_loss(end.parameters, support, query, config, dropout(config.dropout, seed))
-    target = start if second else end.parameters
-    gradients = torch.autograd.grad(loss, tuple(target.values()))
-    with torch.no_grad():
-        before = outer_loss(parameters, support, query, config, dropout(config.dropout, seed))
-    assert end.loss is not None  # there is an inner step at least
-    metrics = {
-        "loss": loss.item(),
-        "loss_unadapted": before.item(),
-        "inner_loss": end.loss,
-        "inner_clipped": end.clipped,
-    }
-    return TaskGradient(flatten(dict(zip(target, gradients, strict=True))), metrics)
-
-
 @dataclass(frozen=True)
 class MilPolicy:
     """The decoder acts, with the adapted encoder's view of the support set at hand: a = f_θ'(s | D)."""
 
     parameters: Parameters
-    cache: transformer.Cache
+    cache: Cache
     standardise: Standardisation
 
     def start(self, episodes: int) -> Int64[np.ndarray, "episodes 0"]:
@@ -318,7 +112,7 @@ class Mil(Standardised[MilConfig]):
             config.feed_forward_units,
             config.shots,
         )
-        return transformer.initialise(sizes, stream)
+        return transformer.initialise(sizes, stream, config.output_scale)
 
     def sample(self, demonstrations: Sequence[Demonstration], iteration: int, stream: np.random.Generator) -> MilBatch:
         """Draw one to `shots` demonstrations as the support set, and query pairs from all others.
@@ -375,21 +169,3 @@ class Mil(Standardised[MilConfig]):
 
     def _support(self, demonstrations: Sequence[Demonstration]) -> Support:
         return Support.of(demonstrations, self.standardise, self.config.positions, self.config.units)
-
-
-def _predictions(
-    parameters: Parameters, context: Support, states: Tensor, config: MilConfig, drop: Dropout
-) -> Float[Tensor, "queries action_dim"]:
-    """Return f_θ(s | D) at some states."""
-    encoded = encode(parameters, *context, config.heads, drop)
-    return decode(parameters, states, cached(parameters, encoded, config.heads), drop)
-
-
-def _leaves(parameters: Parameters) -> dict[str, Tensor]:
-    """Return the same numbers, cut off from what they came from, ready to be differentiated by."""
-    return {name: tensor.detach().requires_grad_() for name, tensor in parameters.items()}
-
-
-def _evenly(count: int, most: int) -> Int64[np.ndarray, " kept"]:
-    """Return indices of all, or of `most` evenly spaced ones from the first to the last."""
-    return np.arange(count) if count <= most else np.linspace(0, count - 1, most).round().astype(np.int64)

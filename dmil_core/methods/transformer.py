@@ -64,13 +64,19 @@ class Sizes(NamedTuple):
     """How many are told apart."""
 
 
-def initialise(sizes: Sizes, stream: np.random.Generator) -> Parameters:
-    """Draw the parameters: uniform weights that keep the variance (LeCun et al. 1998), zero biases, plain norms."""
+def initialise(sizes: Sizes, stream: np.random.Generator, output_scale: float = 1.0) -> Parameters:
+    """Draw the parameters: uniform weights that keep the variance (LeCun et al. 1998), zero biases, plain norms.
+
+    Args:
+        sizes: of the transformer.
+        stream: where the weights are drawn from.
+        output_scale: scale of the output layer's weights, against all others.
+    """
     generator = torch.Generator().manual_seed(int(stream.integers(2**63)))
     parameters: dict[str, Tensor] = {}
 
-    def weight(name: str, outputs: int, inputs: int, *, bias: bool = True) -> None:
-        bound = (3 / inputs) ** 0.5
+    def weight(name: str, outputs: int, inputs: int, *, bias: bool = True, scale: float = 1.0) -> None:
+        bound = scale * (3 / inputs) ** 0.5
         parameters[f"{name}.weight"] = (2 * torch.rand(outputs, inputs, generator=generator) - 1) * bound
         if bias:
             parameters[f"{name}.bias"] = torch.zeros(outputs)
@@ -95,7 +101,7 @@ def initialise(sizes: Sizes, stream: np.random.Generator) -> Parameters:
             weight(f"{prefix}.feed_forward.0", sizes.feed_forward_units, units)
             weight(f"{prefix}.feed_forward.1", units, sizes.feed_forward_units)
         norm(f"{part}.norm")
-    weight("output", sizes.action_dim, units)
+    weight("output", sizes.action_dim, units, scale=output_scale)
     return parameters
 
 
@@ -123,11 +129,11 @@ def position_encoding(places: Int[Tensor, " steps"], units: int) -> Float[Tensor
 
 
 def attention(
-    queries: Float[Tensor, "queries heads*key_units"],
+    queries: Float[Tensor, "queries _"],
     keys: Float[Tensor, "heads key_units tokens"],
     values: Float[Tensor, "heads tokens value_units"],
 ) -> Float[Tensor, "queries heads*value_units"]:
-    """Return softmax(Q Kᵀ / √d_k) V of each head, side by side (Vaswani et al. 2017, equation 1)."""
+    """Return softmax(Q Kᵀ / √d_k) V of each head; heads stand side by side (Vaswani et al. 2017, equation 1)."""
     heads, key_units, _ = keys.shape
     by_head = queries.view(len(queries), heads, key_units).transpose(0, 1)
     weights = torch.matmul(by_head * key_units**-0.5, keys).softmax(-1)
