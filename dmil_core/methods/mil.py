@@ -10,10 +10,10 @@ meta-learning"). At test the same inner steps are taken on the support set, and 
 What the appendix leaves open, and what is done here:
 
 - **Copying.** The support states are asked for with the support itself in the encoder, where each answer could be read
-  off. Hiding step t from the decoder alone is no help: self-attention has carried a_t into all other tokens. So the
-  every other step is predicted from the remaining ones, and the other way round: what is asked for never enters the
-  encoder, and no path leads from a_t to its prediction. It is two passes of half the size. A learned first token
-  is there always, so that a support of one step can be learned from: it is asked for with nothing else to go by.
+  off. Hiding step t from the decoder alone is no help: self-attention has carried a_t into all other tokens. So every
+  other step is predicted from the remaining ones, and the other way round: what is asked for never enters the encoder,
+  and no path leads from a_t to its prediction. It is two passes of half the size. A learned first token is always
+  there, so that a support of one step can be learned from: it is asked for with nothing else to go by.
 - **Pairs.** Table 10's batch of 512 state-action pairs bounds both losses: the inner one asks for all steps of the
   support, or so many evenly spaced ones, and the outer one for as many pairs, drawn evenly from all steps of the task's
   other demonstrations. The encoder sees the whole support in the outer loss, and half of it in each inner pass.
@@ -25,8 +25,9 @@ What the appendix leaves open, and what is done here:
   encoded by sines. Departures from the original transformer are told in `transformer`.
 - **Dropout** applies in the outer loss only: the inner gradient should be of the model that acts.
 - **Inner loop.** One step, inner gradients clipped number by number at ±10, and second order, as in MIL. α is 0.001,
-  the lower end of MIL's 0.001 to 0.01: with 512 units, 0.01 takes an untrained model's loss up. MIL's temporal loss is
-  for videos without actions: here they are given.
+  the lower end of MIL's 0.001 to 0.01: with 512 units, 0.01 takes an untrained model's loss up. The size quick is of
+  first order with α 0.003; with 0.01, on demonstrations of the kitchen, the loss without the inner step rose to over
+  100, which a gradient taken after that step does not see. MIL's temporal loss is for videos without actions: here they are given.
 - **Outer learning rate.** MIL's 1e-3 was for convolutions of 4 layers; with 512 units and no warm-up it is Table 9's
   1e-4 here, and 1e-3 for the small model of the size quick.
 """
@@ -164,7 +165,9 @@ class Mil(Standardised[MilConfig]):
         with torch.no_grad():
             fixed = {name: tensor.detach() for name, tensor in end.items()}
             heads = self.config.heads
-            cache = cached(fixed, encode(fixed, *steps, heads), heads)
+            views = cached(fixed, encode(fixed, *steps, heads), heads)
+        # In one piece, or each action would copy them.
+        cache = tuple((keys.contiguous(), values.contiguous()) for keys, values in views)
         return MilPolicy(fixed, cache, self.standardise)
 
     def _support(self, demonstrations: Sequence[Demonstration]) -> Support:

@@ -51,15 +51,17 @@ class MilConfig(MethodConfig):
             "method": {
                 "layers": 2,
                 "heads": 4,
-                "units": 64,
-                "key_units": 16,
-                "value_units": 16,
+                "units": 128,
+                "key_units": 32,
+                "value_units": 32,
                 "feed_forward_units": 256,
+                "positions": 64,
                 "batch_pairs": 256,
-                "inner_learning_rate": 1e-2,
+                "inner_learning_rate": 3e-3,
                 "order": "first",
             },
-            "evaluation": {"fine_tuning_steps": 1, "learning_rate": 1e-2},
+            "training": {"iterations": 2000},
+            "evaluation": {"fine_tuning_steps": 1, "learning_rate": 3e-3},
         },
         "smoke": {
             "method": {
