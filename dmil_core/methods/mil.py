@@ -27,7 +27,8 @@ What the appendix leaves open, and what is done here:
 - **Inner loop.** One step, inner gradients clipped number by number at ±10, and second order, as in MIL. α is 0.001,
   the lower end of MIL's 0.001 to 0.01: with 512 units, 0.01 takes an untrained model's loss up. The size quick is of
   first order with α 0.003; with 0.01, on demonstrations of the kitchen, the loss without the inner step rose to over
-  100, which a gradient taken after that step does not see. MIL's temporal loss is for videos without actions: here they are given.
+  100, which a gradient taken after that step does not see. MIL's temporal loss is for videos without actions: here
+  they are given.
 - **Outer learning rate.** MIL's 1e-3 was for convolutions of 4 layers; with 512 units and no warm-up it is Table 9's
   1e-4 here, and 1e-3 for the small model of the size quick.
 """

@@ -60,7 +60,7 @@ class MilConfig(MethodConfig):
                 "inner_learning_rate": 3e-3,
                 "order": "first",
             },
-            "training": {"iterations": 2000},
+            "training": {"iterations": 2500},
             "evaluation": {"fine_tuning_steps": 1, "learning_rate": 3e-3},
         },
         "smoke": {
