@@ -42,12 +42,13 @@ from dmil_core.demonstrations import Demonstration, DemonstrationError, Standard
 from dmil_core.losses import Steps, squared_errors, sub_skill_labels
 from dmil_core.meta_gradient import TaskGradient
 from dmil_core.methods.base import Decision, FineTuning, Standardised, SubSkillUse
+from dmil_core.methods.macro_steps import MacroSteps, draw_batch, macro_steps
 from dmil_core.methods.ppo import clipped_surrogate, generalised_advantages, scaled, standardised
 from dmil_core.networks import Layer, Network, Parameters, bank, flatten, initialise, mlp, network, own_states
 from dmil_core.seeding import stream
 from dmil_core.settings import Count, HierarchicalConfig, NotNegative, Positive, Probability, Size
 
-__all__ = ["MacroSteps", "Mlsh", "MlshBatch", "MlshConfig", "MlshPolicy", "draw_batch", "macro_steps"]
+__all__ = ["Mlsh", "MlshBatch", "MlshConfig", "MlshPolicy"]
 
 FRESH_SCALE = 0.01
 """Scale of a fresh high level's last layer, against He's."""
@@ -130,42 +131,6 @@ class MlshConfig(HierarchicalConfig):
             "evaluation": {"learning_rate": 1e-2},
         },
     }
-
-
-class MacroSteps(NamedTuple):
-    """How the steps of trajectories are cut into macro-steps."""
-
-    first: Int[Tensor, " macro_steps"]
-    """The step with which each begins."""
-    of_step: Int[Tensor, " steps"]
-    """The macro-step that each step belongs to."""
-    lengths: Int[Tensor, " trajectories"]
-    """Macro-steps in each trajectory."""
-
-
-def macro_steps(lengths: Int[Tensor, " trajectories"], size: int) -> MacroSteps:
-    """Cut each trajectory into macro-steps of `size` steps from its start on; its last one may be shorter."""
-    starts = lengths.cumsum(0) - lengths
-    position = torch.arange(int(lengths.sum())) - starts.repeat_interleave(lengths)
-    begins = position % size == 0
-    return MacroSteps(begins.nonzero().squeeze(1), begins.cumsum(0) - 1, (lengths + size - 1) // size)
-
-
-def draw_batch(
-    lengths: Int[Tensor, " trajectories"], size: int, generator: torch.Generator
-) -> tuple[Int[Tensor, " size"], Int[Tensor, " drawn"]]:
-    """Draw whole trajectories in random order, each once before any comes again, the last cut off at `size` steps.
-
-    Returns:
-        The steps drawn, and how many of them each drawn trajectory has.
-    """
-    rounds = -(-size // int(lengths.sum()))
-    order = torch.cat([torch.randperm(len(lengths), generator=generator) for _ in range(rounds)])
-    before = lengths[order].cumsum(0) - lengths[order]
-    order, before = order[before < size], before[before < size]
-    drawn = torch.minimum(lengths[order], size - before)
-    starts = (lengths.cumsum(0) - lengths)[order]
-    return (starts - before).repeat_interleave(drawn) + torch.arange(size), drawn
 
 
 @dataclass(frozen=True)
