@@ -277,7 +277,10 @@ class _Task:
         with torch.no_grad():
             outputs = mlp(network(high.parameters, "high"), states[macro.first])
         log_probabilities = outputs[:, :-1].log_softmax(-1)
-        chosen = torch.multinomial(log_probabilities.exp(), 1, generator=self.generator).squeeze(1)
+        # argmax log p − log e, e ~ Exp(1), draws from p (Gumbel-max), and raises nothing where learning has diverged:
+        # what is not finite is then reported by the outer loop, with the slot's name.
+        waiting = torch.empty_like(log_probabilities).exponential_(generator=self.generator)
+        chosen = (log_probabilities - waiting.log()).argmax(-1)
         return _Picks(macro, states[macro.first], chosen, _at(log_probabilities, chosen), outputs[:, -1])
 
     def _outcome_of_picks(self, picks: _Picks, errors: Float[Tensor, " steps"]) -> _Outcome:

@@ -274,6 +274,26 @@ def test_at_a_batchs_first_update_the_loss_of_the_high_level_is_plain_policy_gra
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-6)
 
 
+def test_sub_skills_are_drawn_as_often_as_the_high_level_says(demonstrations) -> None:
+    method = Mlsh.prepared(SMALL, 3, demonstrations)
+    task = mlsh._Task(Steps.of(demonstrations, method.standardise), SMALL, generator())
+    high = method._fresh_high(np.random.default_rng(0), 1e-3)
+    with torch.no_grad():
+        high.parameters["high.2.weight"].zero_()
+        high.parameters["high.2.bias"].copy_(torch.tensor([0.6, 0.3, 0.1, 0.0]).log().nan_to_num(neginf=0.0))
+    picks = task._pick(high, torch.zeros(30_000, 4), torch.tensor([30_000]))
+    shares = torch.bincount(picks.chosen, minlength=3) / 10_000
+    torch.testing.assert_close(shares, torch.tensor([0.6, 0.3, 0.1]), rtol=0, atol=0.02)
+    torch.testing.assert_close(picks.log_probabilities, torch.tensor([0.6, 0.3, 0.1]).log()[picks.chosen])
+
+
+def test_parameters_that_are_not_finite_are_reported_and_not_raised(method, demonstrations) -> None:
+    initial = method.initial_parameters(stream(0, "initial"))
+    parameters = {name: torch.full_like(tensor, torch.nan) for name, tensor in initial.items()}
+    found = method.task_gradient(parameters, method.sample(demonstrations, 0, stream(0, "batch")))
+    assert found.gradient.isnan().any()
+
+
 def test_sub_skills_go_down_the_expected_squared_error(demonstrations) -> None:
     """Averaged over what is drawn, the surrogate's gradient at ρ = 1 is that of E r = −‖μ − a‖² − dσ², without V."""
     config = SMALL.model_copy(update={"deviation": 0.2})
