@@ -464,7 +464,6 @@ def test_learns_two_skills_that_a_fresh_high_level_puts_to_use_in_a_new_task() -
         output_scale=0.1,
         high_learning_rate=1e-2,
         sub_skill_learning_rate=1e-3,
-        clip=0.2,
         warm_up_updates=60,
         joint_updates=30,
         batch_size=300,
@@ -472,7 +471,7 @@ def test_learns_two_skills_that_a_fresh_high_level_puts_to_use_in_a_new_task() -
     )
     sets = training_sets()
     method = Mlsh.prepared(config, 2, list(itertools.chain(*sets.values())))
-    training = TrainingConfig(iterations=40, tasks_per_iteration=4, outer_step="average", learning_rate=1.0)
+    training = TrainingConfig(iterations=20, tasks_per_iteration=4, outer_step="average", learning_rate=1.0)
     parameters = meta_trained(method, sets, training)
     demonstrations, skills = record(101, 12)
     found, errors = [], []
