@@ -13,7 +13,8 @@ from dmil_core.losses import Steps
 from dmil_core.methods import mlsh
 from dmil_core.methods.base import FineTuning, MetaLearner
 from dmil_core.methods.macro_steps import draw_batch, macro_steps
-from dmil_core.methods.mlsh import Mlsh, MlshConfig, MlshPolicy
+from dmil_core.methods.mlsh import Mlsh, MlshPolicy
+from dmil_core.methods.mlsh_config import MlshConfig
 from dmil_core.methods.ppo import clipped_surrogate, generalised_advantages, scaled, standardised
 from dmil_core.networks import flatten, mlp, unflatten
 from dmil_core.seeding import stream
