@@ -61,10 +61,11 @@ class MlshConfig(HierarchicalConfig):
                 "warm_up_updates": 60,
                 "joint_updates": 30,
                 "batch_size": 300,
+                "deviation": 0.6,
                 "trajectories": 16,
             },
             "training": {
-                "iterations": 200,
+                "iterations": 250,
                 "outer_step": "average",
                 "learning_rate": 1.0,
                 "gradient_clip": None,
