@@ -1,0 +1,90 @@
+"""The settings of MLSH, each with the place in the paper that it comes from."""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
+
+from dmil_core.settings import Count, HierarchicalConfig, NotNegative, Positive, Probability, Size
+
+__all__ = ["MlshConfig"]
+
+
+class MlshConfig(HierarchicalConfig):
+    """Meta Learning Shared Hierarchies, behaviour-cloning variant."""
+
+    name: Literal["mlsh"] = "mlsh"
+    """The method."""
+    hidden_layers: Size = 4
+    """Layers of ReLU units in each network, as DMIL's (F.2)."""
+    hidden_units: Size = 512
+    """Units in each hidden layer (F.2)."""
+    output_scale: Positive = 1.0
+    """Scale of the sub-skills' first output weights, against He's."""
+    macro_step: Size = 3
+    """Steps that a sub-skill acts before the high level picks anew (F.2)."""
+    high_learning_rate: Positive = 1e-3
+    """Of the high level's Adam (Table 11)."""
+    sub_skill_learning_rate: Positive = 1e-4
+    """Of the sub-skills' Adam (Table 11)."""
+    clip: Positive = 0.02
+    """ε, how far PPO's ratio may go from 1 (Table 11)."""
+    warm_up_updates: Count = 500
+    """Updates of the fresh high level alone (Table 11)."""
+    joint_updates: Count = 1000
+    """Updates of both levels after that (Table 11)."""
+    batch_size: Size = 900
+    """State-action pairs in a batch (Table 11)."""
+    passes: Size = 3
+    """Updates from one batch."""
+    deviation: Positive = 0.3
+    """σ of the sub-skills' actions in training."""
+    discount: Probability = 0.0
+    """γ."""
+    trace: Probability = 0.98
+    """λ of generalised advantages; without effect where γ = 0."""
+    value_weight: NotNegative = 0.5
+    """c, the weight of the values' squared error."""
+    trajectories: Size = 64
+    """Demonstrations that a sampled task contributes, as many as DMIL's four sets; where there are fewer, all."""
+
+    sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "paper": {
+            "training": {"outer_step": "average", "learning_rate": 1.0},
+            "evaluation": {"fine_tuning_steps": 500, "learning_rate": 1e-3},
+        },
+        "quick": {
+            "method": {
+                "hidden_layers": 3,
+                "hidden_units": 256,
+                "output_scale": 0.07,
+                "high_learning_rate": 1e-2,
+                "sub_skill_learning_rate": 3e-3,
+                "warm_up_updates": 60,
+                "joint_updates": 30,
+                "batch_size": 300,
+                "deviation": 0.6,
+                "trajectories": 16,
+            },
+            "training": {
+                "iterations": 250,
+                "outer_step": "average",
+                "learning_rate": 1.0,
+                "gradient_clip": None,
+                "checkpoint_every": 25,
+            },
+            "evaluation": {"fine_tuning_steps": 100, "learning_rate": 1e-2},
+        },
+        "smoke": {
+            "method": {
+                "hidden_layers": 2,
+                "hidden_units": 32,
+                "high_learning_rate": 1e-2,
+                "sub_skill_learning_rate": 1e-3,
+                "warm_up_updates": 10,
+                "joint_updates": 20,
+                "batch_size": 90,
+                "trajectories": 4,
+            },
+            "training": {"outer_step": "average", "learning_rate": 1.0},
+            "evaluation": {"learning_rate": 1e-2},
+        },
+    }
