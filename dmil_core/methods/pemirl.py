@@ -77,7 +77,7 @@ class PemirlConfig(MethodConfig):
     """Trajectories that are explained in each task (Table 12)."""
     contexts: Size = 4
     """C, how many other trajectories m is inferred from, each for its share of the explained ones."""
-    steps: Count | None = None
+    steps_per_trajectory: Count | None = None
     """Use at most so many steps of each trajectory, drawn at random; none uses all. All losses are means over steps."""
     discount: NotNegative = 1.0
     """γ, the coefficient of h_φ (Table 12)."""
@@ -97,7 +97,7 @@ class PemirlConfig(MethodConfig):
                 "hidden_units": 256,
                 "output_scale": 0.07,
                 "trajectories": 8,
-                "steps": 32,
+                "steps_per_trajectory": 32,
             },
         },
         "smoke": {
@@ -107,7 +107,7 @@ class PemirlConfig(MethodConfig):
                 "hidden_units": 32,
                 "trajectories": 4,
                 "contexts": 2,
-                "steps": 24,
+                "steps_per_trajectory": 24,
             },
         },
     }
@@ -172,7 +172,7 @@ class Pemirl(Standardised[PemirlConfig]):
         """Return the gradient of the weighted sum of all losses."""
         config, generator = self.config, torch.Generator().manual_seed(material.seed)
         contexts, explained = (
-            Transitions.of(demonstrations, self.standardise).thinned(config.steps, generator)
+            Transitions.of(demonstrations, self.standardise).thinned(config.steps_per_trajectory, generator)
             for demonstrations in (material.contexts, material.explained)
         )
         leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in parameters.items()}

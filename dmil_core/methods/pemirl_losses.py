@@ -4,6 +4,7 @@ Parameters are named by model: ``encoder`` is q_ψ(m|τ), ``policy`` with ``log_
 r_θ(s,m), ``potential`` is h_φ(s,m). How they fit together is told in `pemirl`.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
@@ -47,7 +48,7 @@ class Gaussian(NamedTuple):
     def log_density(self, values: Float[Tensor, "rows size"]) -> Float[Tensor, " rows"]:
         """Return log N(values; mean, σ²), summed over each row."""
         standard = (values - self.mean) * torch.exp(-self.log_deviation)
-        log_normaliser = self.log_deviation + 0.5 * torch.log(torch.tensor(2 * torch.pi))
+        log_normaliser = self.log_deviation + 0.5 * math.log(2 * math.pi)
         return -(0.5 * standard.square() + log_normaliser).sum(-1)
 
     def divergence(self) -> Float[Tensor, " rows"]:
