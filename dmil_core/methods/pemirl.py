@@ -27,10 +27,13 @@ What the appendix leaves open, and what we chose:
   steps on the same actions; the first has the ratio 1, where the clipped surrogate has the gradient above. So there is
   no setting for it.
 - Imitation has the weight 1, as in the original's pre-training (−log π + 0.1 KL), not the 0.01 of its second phase,
-  which would leave the actions to a policy term that has nothing to teach here; that one has 0.1. At 1 and more it
-  outweighs the imitation's hold on σ, which then goes to its bound.
-- m is inferred from one trajectory and explains others of the task, so it cannot hold what is particular to one. The
-  original has it explain its own. C of the 16 trajectories' worth of m are drawn: C = 1 is the original's layout.
+  which would leave the actions to a policy term that has nothing to teach here. That one has 0.1: it pulls each log σ
+  up by its weight over the deviation of the rewards (at least √(d/2) for d actions), imitation holds it down by at
+  most 1. With the weight 1, on the tests' toy, σ grew to 1.6, m came to mean nothing (KL 0.004), and the actions' error
+  was that of m = 0; without the term all was as with 0.1.
+- m is inferred from one trajectory and explains others of the task, so it cannot hold what is particular to one; the
+  original has it explain its own. Of the 16 trajectories each m explains 16 / C; with C = 1 there is one m a task, as
+  in the original.
 - q_ψ is one network on (s, a), averaged over the steps, as trajectories are ragged; the original reads a whole
   trajectory of fixed length. m has the original's 3 dimensions.
 - R_θ is the mean of r_θ over the steps, where the original takes the sum. Replayed trajectories do not answer to the

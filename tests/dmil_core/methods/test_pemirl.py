@@ -282,6 +282,37 @@ def test_gradients_are_finite_differences(losses, parameters, name: str) -> None
     )
 
 
+@pytest.mark.parametrize("negatives", ["same", "mismatched"])
+def test_information_policy_and_negatives_look_at_the_policys_own_actions(
+    method, demonstrations, losses, parameters, negatives: Literal["same", "mismatched"]
+) -> None:
+    leaves, generator = leaves_of(parameters), torch.Generator().manual_seed(11)
+    contexts, explained = (
+        doubled(Transitions.of(part, method.standardise)) for part in (demonstrations[:2], demonstrations[2:7])
+    )
+    chosen = infer(leaves, contexts).draw(generator).detach()[[0, 1, 0, 1, 0]]
+    of_steps = torch.arange(5).repeat_interleave(explained.lengths)
+    policy = action_distribution(leaves, explained.states, chosen[of_steps])
+    actions = policy.draw(generator).detach()
+    log_probabilities = policy.log_density(actions)
+    f = log_reward(leaves, explained, chosen[of_steps], SMALL.discount).f
+    negative_logits = f - log_probabilities.detach()
+    if negatives == "mismatched":
+        m = torch.randn(5, 2, generator=generator, dtype=torch.float64)[of_steps]
+        other = action_distribution(leaves, explained.states, m)
+        log_other = other.log_density(other.draw(generator)).detach()
+        negative_logits = log_reward(leaves, explained, m, SMALL.discount).f - log_other
+    expected = {
+        "information": -infer(leaves, explained._replace(actions=actions)).log_density(chosen).mean(),
+        "policy": policy_surrogate(log_probabilities, f - log_probabilities),
+        "discriminator": discriminator_loss(f - policy.log_density(explained.actions).detach(), negative_logits),
+    }
+    found = losses(leaves, negatives)
+    for name, loss in expected.items():
+        torch.testing.assert_close(getattr(found, name), loss)
+        torch.testing.assert_close(gradients(getattr(found, name), leaves), gradients(loss, leaves))
+
+
 def test_mismatched_negatives_change_the_discriminator_alone(losses, parameters) -> None:
     same, mismatched = losses(parameters), losses(parameters, "mismatched")
     assert same.discriminator != mismatched.discriminator
