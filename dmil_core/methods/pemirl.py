@@ -17,9 +17,9 @@ At test m is the mean of q_ψ's means over the shots, and π_ω's mean acts; the
 
 What this variant can teach. On demonstrated transitions the expert and the policy share s and s′, and f does not depend
 on the action. So f tends to the middle of the two log π, and the policy's expected gradient is that of its entropy,
-for any f: it widens σ and says nothing of the mean. All that the actions learn comes from the imitation term, all that
-m means too; reward and potential stand beside. Negatives with a mismatched m, one of N(0, 1), at least ask the reward
-which states go with m, but they do not change this.
+for any f: it widens σ and says nothing of the mean. All that the mean action learns comes from the imitation term;
+reward and potential stand beside. Negatives with a mismatched m, one of N(0, 1), at least ask the reward which states
+go with m, but the policy's expected gradient stays the entropy's, and q_ψ gets none from the discriminator.
 
 What the appendix leaves open, and what we chose:
 
@@ -30,7 +30,7 @@ What the appendix leaves open, and what we chose:
   which would leave the actions to a policy term that has nothing to teach here. That one has 0.1: it pulls each log σ
   up by its weight over the deviation of the rewards (at least √(d/2) for d actions), imitation holds it down by at
   most 1. With the weight 1, on the tests' toy, σ grew to 1.6, m came to mean nothing (KL 0.004), and the actions' error
-  was that of m = 0; without the term all was as with 0.1.
+  was that of m = 0; without the term it was about as with 0.1.
 - m is inferred from one trajectory and explains others of the task, so it cannot hold what is particular to one; the
   original has it explain its own. Of the 16 trajectories each m explains 16 / C; with C = 1 there is one m a task, as
   in the original.
