@@ -39,22 +39,27 @@ What the appendix leaves open, and what we chose:
 - R_θ is the mean of r_θ over the steps, where the original takes the sum. Replayed trajectories do not answer to the
   reward, so nothing but the discriminator, which is a mean over steps too, holds it.
 - The discriminator does not train ψ, as in the text of the original; its code does it.
-- The last state of a demonstration is its own successor. σ does not depend on the state. Hidden layers of reward and
-  potential are as wide as the others.
+- σ of the policy does not depend on the state and starts at 0.3, where the original's starts at 1: Adam moves log σ by
+  at most its learning rate a step, and from 1 the paper's 1e-4 would leave it above 0.8 for 2000 iterations, with
+  likelihoods so flat that the divergence outweighs what m could tell.
+- The last state of a demonstration is its own successor. Hidden layers of reward and potential are as wide as the
+  others.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
+from pydantic import Field
 
 from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.meta_gradient import TaskGradient
 from dmil_core.methods.base import FineTuning, Standardised
 from dmil_core.methods.behaviour_cloning import NetworkPolicy
-from dmil_core.methods.pemirl_losses import Transitions, infer, losses_of
+from dmil_core.methods.pemirl_losses import BOUND, Transitions, infer, losses_of
 from dmil_core.networks import Layer, Parameters, flatten, initialise, network
 from dmil_core.settings import Count, MethodConfig, NotNegative, Positive, Size
 
@@ -76,6 +81,8 @@ class PemirlConfig(MethodConfig):
     """Scale of the output layers' first weights, against He's."""
     context_dim: Size = 3
     """Numbers in m; the original's."""
+    initial_deviation: Annotated[float, Field(ge=0.01, le=10)] = 0.3
+    """The policy's σ at first, in the environment's units."""
     trajectories: Size = 16
     """Trajectories that are explained in each task (Table 12)."""
     contexts: Size = 4
@@ -139,7 +146,7 @@ class Pemirl(Standardised[PemirlConfig]):
     config_type = PemirlConfig
 
     def initial_parameters(self, stream: np.random.Generator) -> Parameters:
-        """Draw the four models; the policy's σ is 1 at first."""
+        """Draw the four models; only σ is set."""
         config = self.config
         of_policy, of_reward = (
             [config.hidden_units] * layers for layers in (config.hidden_layers, config.reward_layers)
@@ -154,7 +161,8 @@ class Pemirl(Standardised[PemirlConfig]):
         drawn: dict[str, torch.Tensor] = {}
         for prefix, units in sizes.items():
             drawn |= initialise(prefix, units, stream, output_scale=config.output_scale)
-        return {**drawn, "log_deviation": torch.zeros(self.action_dim)}
+        raw = BOUND * math.atanh(math.log(config.initial_deviation) / BOUND)
+        return {**drawn, "log_deviation": torch.full((self.action_dim,), raw)}
 
     def sample(
         self, demonstrations: Sequence[Demonstration], iteration: int, stream: np.random.Generator

@@ -18,6 +18,7 @@ from dmil_core.losses import Steps
 from dmil_core.networks import Parameters, mlp, network
 
 __all__ = [
+    "BOUND",
     "Gaussian",
     "Losses",
     "Transitions",

@@ -12,7 +12,7 @@ from dmil_core.demonstrations import Demonstration, DemonstrationError, Standard
 from dmil_core.methods.base import FineTuning, MetaLearner, Policy
 from dmil_core.methods.behaviour_cloning import BehaviourCloning, BehaviourCloningConfig
 from dmil_core.methods.pemirl import ContextBatch, Pemirl, PemirlConfig
-from dmil_core.methods.pemirl_losses import Transitions, infer, losses_of
+from dmil_core.methods.pemirl_losses import Transitions, action_distribution, infer, losses_of
 from dmil_core.networks import flatten, network
 from dmil_core.seeding import stream
 from tests.dmil_core.methods.toys import STEPS, meta_trained, practise, record, training_sets
@@ -67,6 +67,13 @@ def test_initial_parameters_have_the_sizes_of_the_settings(method) -> None:
         "potential.1.bias": (1,),
         "log_deviation": (3,),
     }
+
+
+@pytest.mark.parametrize("deviation", [0.01, 0.3, 10.0])
+def test_the_policys_deviation_begins_as_set(method, deviation: float) -> None:
+    method = Pemirl(SMALL.model_copy(update={"initial_deviation": deviation}), 3, method.standardise)
+    policy = action_distribution(method.initial_parameters(stream(0, "initial")), torch.zeros(5, 4), torch.zeros(5, 2))
+    torch.testing.assert_close(policy.log_deviation.exp(), torch.full((1, 3), deviation))
 
 
 def test_a_sample_has_different_demonstrations_where_there_are_enough(method, demonstrations) -> None:

@@ -27,7 +27,14 @@ from dmil_core.networks import Parameters, network
 from dmil_core.seeding import stream
 
 SMALL = PemirlConfig(
-    hidden_layers=2, reward_layers=1, hidden_units=8, context_dim=2, trajectories=5, contexts=2, discount=0.9
+    hidden_layers=2,
+    reward_layers=1,
+    hidden_units=8,
+    context_dim=2,
+    initial_deviation=1.0,
+    trajectories=5,
+    contexts=2,
+    discount=0.9,
 )
 MODELS = ("encoder", "policy", "log_deviation", "reward", "potential")
 TRAINED = {
