@@ -43,9 +43,14 @@ class OptionModel(NamedTuple):
 
     @classmethod
     def of(cls, parameters: Parameters, least_log_deviation: float) -> "OptionModel":
-        """Return views of ``high.*``, ``low.*`` and ``log_deviations``, which is kept within its bounds."""
-        log_deviations = parameters["log_deviations"].clamp(least_log_deviation, LARGEST_LOG_DEVIATION)
-        return cls(network(parameters, "high"), bank(parameters, "low"), log_deviations)
+        """Return views of ``high.*`` and ``low.*``, and ``log_deviations`` within its bounds.
+
+        Its gradient is as if there were no bounds: a plain clamp has none beyond them, so what a single step took
+        there would never come back.
+        """
+        free = parameters["log_deviations"]
+        bound = free.clamp(least_log_deviation, LARGEST_LOG_DEVIATION)
+        return cls(network(parameters, "high"), bank(parameters, "low"), free + (bound - free).detach())
 
     @property
     def options(self) -> int:
