@@ -224,7 +224,7 @@ class OptionGail(_Options):
 
     def _imitate_for_some_steps(self, moved: dict[str, Tensor], demonstrated: Steps, phase: Phase) -> dict[str, float]:
         """Descend in place, and return the metrics before."""
-        descent = torch.optim.Adam(named(moved, POLICY), lr=self.config.learning_rate, fused=True)
+        descent = torch.optim.Adam(named(moved, POLICY), lr=self.config.offline_learning_rate, fused=True)
         metrics = []
         for _ in range(self.config.offline_steps):
             imitated = self._imitate(moved, demonstrated, phase)

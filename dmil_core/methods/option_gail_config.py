@@ -66,12 +66,14 @@ class OptionGailConfig(OptionConfig):
     """Iterations before the adversarial ones."""
     offline_steps: Count = 10
     """A slot's own steps of Adam in an offline iteration, each on all that it drew."""
+    offline_learning_rate: Positive = 1e-3
+    """Of a slot's own Adam in an offline iteration: log σ goes down by no more than this in a step."""
     environment_steps: Count = 410
     """A slot's steps in its task's environments in an adversarial iteration: 10 slots have the original's 4,096."""
     learning_rate: Positive = 3e-4
-    """Of a slot's own Adam."""
+    """Of a slot's own Adam in an adversarial iteration."""
     weight_decay: NotNegative = 1e-3
-    """Of the same, in the adversarial iterations."""
+    """Of the same."""
     minibatch: Size = 64
     """Steps in one step of the discriminator, from either side, and of PPO."""
     discriminator_passes: Count = 10

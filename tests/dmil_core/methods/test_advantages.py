@@ -9,9 +9,9 @@ import torch
 from dmil_core.methods.advantages import clipped_surrogate, generalised_advantages
 
 
-@pytest.mark.parametrize(
-    ("steps", "discount", "smoothing"), [*itertools.product([1, 2, 7], [0.0, 0.9], [0.0, 0.5, 1.0])]
-)
+@pytest.mark.parametrize("steps", [1, 2, 7])
+@pytest.mark.parametrize("discount", [0.0, 0.9])
+@pytest.mark.parametrize("smoothing", [0.0, 0.5, 1.0])
 def test_advantages_are_the_discounted_sum_of_errors(steps: int, discount: float, smoothing: float) -> None:
     draw = np.random.default_rng(steps)
     rewards, values = draw.normal(size=steps), draw.normal(size=steps + 1)

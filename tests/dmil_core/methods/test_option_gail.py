@@ -213,7 +213,9 @@ def test_an_offline_slot_goes_one_step_of_adam(offline, playing, demonstrations,
         if slope is None:
             assert not way.any()
         else:  # Adam's first step
-            torch.testing.assert_close(way, PLAYING.learning_rate * slope / (slope.abs() + 1e-8), rtol=1e-2, atol=1e-6)
+            torch.testing.assert_close(
+                way, PLAYING.offline_learning_rate * slope / (slope.abs() + 1e-8), rtol=1e-2, atol=1e-6
+            )
 
 
 @pytest.mark.parametrize("iteration", [0, 2, 4])
