@@ -107,7 +107,7 @@ def discriminate(
 ) -> dict[str, float]:
     """Teach the discriminator in place, each minibatch of the policy's steps against as many demonstrated ones."""
     losses, k = [], config.sub_skills
-    descent = torch.optim.Adam(
+    descent = torch.optim.AdamW(
         named(moved, "discriminator."), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
     )
     for index in _minibatches(len(played.options), config.minibatch, config.discriminator_passes, generator):
@@ -217,7 +217,7 @@ def improve(
     """Improve both levels and the critic in place, down L = −L_clip of either level − c·entropy + ½(V_L − return)²."""
     with torch.no_grad():
         old = decisions(moved, played, config)
-    descent = torch.optim.Adam(
+    descent = torch.optim.AdamW(
         named(moved, (*POLICY, "critic.")), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
     )
     for index in _minibatches(len(played.options), config.minibatch, config.policy_epochs, generator):

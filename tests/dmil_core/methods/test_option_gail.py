@@ -1,5 +1,6 @@
 """OptionGAIL and its half without play: their gradients, what they do with practice, and that they learn."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 import torch
 from torch.distributions import Normal
 
+from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.losses import Steps
 from dmil_core.methods.base import FineTuning, MetaLearner, PractisingLearner, Rollout
@@ -35,6 +37,7 @@ from dmil_core.methods.option_policies import OptionExplorer
 from dmil_core.methods.options import Chain, OptionModel, log_likelihood, options_before, viterbi
 from dmil_core.networks import Parameters, flatten, unflatten
 from dmil_core.seeding import stream
+from tests.dmil_core.methods.toys import STEPS, meta_trained, practise, record, recovered, training_sets
 
 OFFLINE = OptionGailOfflineConfig(hidden_layers=2, hidden_units=8, trajectories=3, likelihood_iterations=2)
 PLAYING = OptionGailConfig(
@@ -470,3 +473,44 @@ def test_a_round_is_pure_and_reports_what_it_took(playing, demonstrations, rollo
     assert found.metrics["environment_steps"] == 9
     assert found.metrics["practice_success"] == pytest.approx(1 / 3)
     assert all(way.any() for way in like(found.gradient, parameters).values())
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_practice_improves_a_known_reward() -> None:
+    """The explorer, the advantages and PPO, with a reward in place of the discriminator's: where to go, and how."""
+    demonstrations = record(0, 2).demonstrations
+    config = PLAYING.model_copy(
+        update={"sub_skills": 2, "hidden_layers": 1, "hidden_units": 16, "output_scale": 0.1}
+        | {"learning_rate": 3e-3, "minibatch": 64, "policy_epochs": 4, "discount": 0.9}
+    )
+    method = OptionGail.prepared(config, 2, demonstrations)
+    moved = {name: tensor.requires_grad_() for name, tensor in method.initial_parameters(stream(0, "initial")).items()}
+    means = []
+    for iteration in range(25):
+        material = method.sample(demonstrations, config.offline_iterations, stream(0, "batch", iteration))
+        rollouts = practise(method.explorer(moved, material), "task-0", iteration, 5 * STEPS)
+        played = Played.of_rollouts(rollouts, method.standardise, 2)
+        rewards = -(played.steps.actions - torch.tensor([-1.0, 0.5])).square().sum(1) + 2.0 * (played.options == 1)
+        last = torch.from_numpy(method.standardise(np.stack([one.observations[-1] for one in rollouts])))
+        aims = aims_of(moved, played, rewards, last, config)
+        improve(moved, played, aims, config, torch.Generator().manual_seed(iteration))
+        means.append(rewards.mean().item())
+    # At first −(1² + 0.5² + 2σ²) + 1 = −2.25; at best 2, less 2σ².
+    assert means[0] == pytest.approx(-2.25, abs=0.5)
+    assert means[-1] > 0.5
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_tells_two_skills_apart_in_a_new_task_offline() -> None:
+    config = OptionGailOfflineConfig(
+        sub_skills=2, hidden_layers=1, hidden_units=32, output_scale=0.1, trajectories=4, likelihood_iterations=0
+    )
+    sets = training_sets()
+    method = OptionGailOffline.prepared(config, 2, list(itertools.chain(*sets.values())))
+    training = TrainingConfig(iterations=300, tasks_per_iteration=4, learning_rate=1e-2)
+    parameters = meta_trained(method, sets, training)
+    demonstrations, skills = record(101, 8)
+    policy = method.adapt(parameters, demonstrations[:2], FineTuning(100, 1e-2))
+    assert recovered(skills, [policy.sub_skill_use(one).chosen for one in demonstrations]) >= 0.95
+    successes = [rollout.success for rollout in practise(policy, "task-101", 5, 10 * STEPS)]
+    assert np.mean(successes) >= 0.9
