@@ -7,7 +7,11 @@ from dmil_core.errors import UserError, shown
 from dmil_core.methods.base import Standardised
 from dmil_core.methods.behaviour_cloning import BehaviourCloning, PerTask
 from dmil_core.methods.dmil import Dmil
+from dmil_core.methods.mil import Mil
+from dmil_core.methods.mlsh import Mlsh
 from dmil_core.methods.nearest_neighbour import NearestNeighbour
+from dmil_core.methods.option_gail import OptionGail, OptionGailOffline
+from dmil_core.methods.pemirl import Pemirl
 from dmil_core.settings import MethodConfig
 
 __all__ = ["ENTRY_POINTS", "MethodError", "config_type", "method_names", "method_type"]
@@ -16,6 +20,11 @@ ENTRY_POINTS = "dmil.methods"
 """The group of entry points in which a package registers a method, see `Standardised`."""
 OURS: dict[str, type[Standardised[Any]]] = {
     "dmil": Dmil,
+    "option-gail": OptionGail,
+    "option-gail-offline": OptionGailOffline,
+    "mil": Mil,
+    "mlsh": Mlsh,
+    "pemirl": Pemirl,
     "behaviour-cloning": BehaviourCloning,
     "per-task": PerTask,
     "nearest-neighbour": NearestNeighbour,
