@@ -29,8 +29,8 @@ What the appendix leaves open, and what we chose:
 - Imitation has the weight 1, as in the original's pre-training (−log π + 0.1 KL), not the 0.01 of its second phase,
   which would leave the actions to a policy term that has nothing to teach here. That one has 0.1: it pulls each log σ
   up by its weight over the deviation of the rewards (at least √(d/2) for d actions), imitation holds it down by at
-  most 1. With the weight 1, on the tests' toy, σ grew to 1.6, m came to mean nothing (KL 0.004), and the actions' error
-  was that of m = 0; without the term it was about as with 0.1.
+  most 1. With the weight 1, on the tests' toy, σ grew from 1 to 1.6, m came to mean nothing (KL 0.004), and
+  the actions' error was that of m = 0; without the term it was about as with 0.1.
 - m is inferred from one trajectory and explains others of the task, so it cannot hold what is particular to one; the
   original has it explain its own. Of the 16 trajectories each m explains 16 / C; with C = 1 there is one m a task, as
   in the original.

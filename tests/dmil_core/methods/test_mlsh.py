@@ -275,13 +275,61 @@ def test_at_a_batchs_first_update_the_loss_of_the_high_level_is_plain_policy_gra
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-6)
 
 
+def test_a_joint_update_goes_down_the_policy_gradients_of_both_levels(demonstrations, plain_mlp) -> None:
+    """Against plain autograd on the same draws, each step run on all sub-skills and picked from."""
+    config = SMALL.model_copy(update={"value_weight": 0.7, "batch_size": 19})
+    method = Mlsh.prepared(config, 3, demonstrations)
+    steps = Steps.of(demonstrations[:3], method.standardise)  # 19 steps: one batch takes each trajectory once
+    bank = mlsh._Learning(method.initial_parameters(stream(0, "initial")), 1e-4)
+    high = method._fresh_high(np.random.default_rng(0), 1e-3)
+    levels = [high, bank]
+    before = [
+        {name: tensor.detach().clone().requires_grad_() for name, tensor in level.parameters.items()}
+        for level in levels
+    ]
+    mlsh._Task(steps, config, generator()).learn(high, bank, 1)
+
+    again = mlsh._Task(steps, config, generator())
+    index, lengths = again._draw_batch()
+    fresh = mlsh._Learning(before[0], 1e-3)
+    picks = again._pick(fresh, steps.states[index], lengths)
+    z = picks.chosen[macro_steps(lengths, 3).of_step]
+    assert len(set(z.tolist())) > 1
+    states, demonstrated = steps.states[index], steps.actions[index]
+    outputs = torch.stack([plain_mlp(sub_skill, states) for sub_skill in mlsh.bank(before[1], "low")])[z, range(19)]
+    means, values = outputs[:, :-1], outputs[:, -1]
+    actions = (means + 0.3 * torch.randn(19, 3, generator=again.generator)).detach()
+    rewards = -(actions - demonstrated).square().sum(-1)
+    rewards = rewards / rewards.square().mean().sqrt()
+    log_densities = torch.distributions.Normal(means, 0.3).log_prob(actions).sum(-1)
+    low_loss = -(_standard(rewards - values) * log_densities).mean() + 0.7 * (values - rewards).square().mean()
+
+    errors = (means - demonstrated).square().sum(-1).detach()
+    bounds = [*picks.macro.first.tolist(), 19]
+    returns = torch.stack([-errors[a:b].sum() for a, b in itertools.pairwise(bounds)])
+    returns = returns / returns.square().mean().sqrt()
+    high_outputs = plain_mlp(mlsh.network(before[0], "high"), states[bounds[:-1]])
+    log_probabilities = high_outputs[:, :-1].log_softmax(-1)[range(len(returns)), picks.chosen]
+    values = high_outputs[:, -1]
+    high_loss = -(_standard(returns - values) * log_probabilities).mean() + 0.7 * (values - returns).square().mean()
+    for level, start, loss in zip(levels, before, (high_loss, low_loss), strict=True):
+        expected = torch.autograd.grad(loss, list(start.values()))
+        for tensor, gradient in zip(level.parameters.values(), expected, strict=True):
+            torch.testing.assert_close(tensor.grad, gradient, rtol=1e-3, atol=1e-5)
+        assert all(not torch.equal(tensor, start[name]) for name, tensor in level.parameters.items())
+
+
+def _standard(advantages: torch.Tensor) -> torch.Tensor:
+    return ((advantages - advantages.mean()) / advantages.std(correction=0)).detach()
+
+
 def test_sub_skills_are_drawn_as_often_as_the_high_level_says(demonstrations) -> None:
     method = Mlsh.prepared(SMALL, 3, demonstrations)
     task = mlsh._Task(Steps.of(demonstrations, method.standardise), SMALL, generator())
     high = method._fresh_high(np.random.default_rng(0), 1e-3)
     with torch.no_grad():
         high.parameters["high.2.weight"].zero_()
-        high.parameters["high.2.bias"].copy_(torch.tensor([0.6, 0.3, 0.1, 0.0]).log().nan_to_num(neginf=0.0))
+        high.parameters["high.2.bias"].copy_(torch.tensor([0.6, 0.3, 0.1, 1.0]).log())
     picks = task._pick(high, torch.zeros(30_000, 4), torch.tensor([30_000]))
     shares = torch.bincount(picks.chosen, minlength=3) / 10_000
     torch.testing.assert_close(shares, torch.tensor([0.6, 0.3, 0.1]), rtol=0, atol=0.02)
