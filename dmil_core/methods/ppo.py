@@ -52,7 +52,7 @@ def generalised_advantages(
     following = torch.cat([value[:, 1:], torch.zeros_like(value[:, :1])], 1)
     advantages = reward + discount * following - value
     for step in reversed(range(longest - 1)):
-        advantages[:, step] += discount * trace * advantages[:, step + 1] * within[:, step + 1]
+        advantages[:, step] += discount * trace * advantages[:, step + 1]
     return advantages[within]
 
 
