@@ -20,7 +20,10 @@ What the sources leave open, and what is chosen here:
   Each level has advantages of its own (`advantages`, which says why they are not RLlib's), standardised per round.
 - *Ends.* The reward is positive everywhere, so an episode cut off at its success would be worth less than one that
   never succeeds. Ends come from the protocol and not from the task: every episode is valued by V_H beyond its end.
-- *Scale.* Rewards are multiplied by 1 − γ, which changes no standardised advantage and keeps values near 1.
+- *Centre.* Rewards are taken less their mean over the round. As every episode goes on beyond its end, that changes no
+  true advantage, and it keeps values near 0, where the critic starts.
+- *Weight decay* is decoupled (Loshchilov & Hutter 2019): with moments that start at 0, an L2 term would move a weight
+  of little gradient at the full rate.
 - *Slots.* The original's epoch of 4,096 steps is an iteration here, its steps split over the tasks of its slots. A
   slot takes its own steps of Adam from where the iteration starts and returns the way, parameters before minus after;
   the outer step goes to the slots' mean (``outer_step: average``), as in federated averaging (McMahan et al. 2017).
