@@ -61,7 +61,7 @@ class OptionGailConfig(OptionConfig):
     """The method."""
     likelihood_iterations: Iterations = 60
     """So many iterations go up the likelihood, before the other offline ones, which are of hard EM."""
-    offline_iterations: Iterations = 500
+    offline_iterations: Iterations = 400
     """Iterations before the adversarial ones."""
     offline_steps: Count = 10
     """A slot's own steps of Adam in an offline iteration, each on all that it drew."""
@@ -94,7 +94,7 @@ class OptionGailConfig(OptionConfig):
 
     sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "paper": {
-            "training": {"iterations": 4500, "outer_step": "average", "learning_rate": 1.0},
+            "training": {"iterations": 4400, "outer_step": "average", "learning_rate": 1.0},
             "evaluation": {"learning_rate": 3e-4},
         },
         "quick": {

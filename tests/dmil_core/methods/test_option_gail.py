@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.distributions import Normal
 
-from dmil_core.configs import TrainingConfig
+from dmil_core.configs import SIZES, EvaluationConfig, TrainingConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.losses import Steps
 from dmil_core.methods.base import FineTuning, MetaLearner, Policy, PractisingLearner, Rollout
@@ -105,6 +105,23 @@ def test_they_are_what_their_types_say(offline, playing) -> None:
     assert isinstance(offline, MetaLearner)
     assert not isinstance(offline, PractisingLearner)
     assert isinstance(playing, PractisingLearner)
+
+
+@pytest.mark.parametrize("size", ["paper", "quick", "smoke"])
+@pytest.mark.parametrize("config_type", [OptionGailOfflineConfig, OptionGailConfig])
+def test_every_size_has_all_of_its_phases(config_type, size: str) -> None:
+    own = config_type.sizes[size]
+    config = config_type(**own.get("method", {}))
+    common = SIZES[size]
+    training = TrainingConfig(**common.training.model_dump() | own.get("training", {}))
+    EvaluationConfig(**common.evaluation.model_dump() | own["evaluation"])
+    assert training.iterations % training.checkpoint_every == 0
+    if isinstance(config, OptionGailConfig):
+        assert 0 < config.likelihood_iterations < config.offline_iterations < training.iterations
+        assert (training.outer_step, training.learning_rate, training.gradient_clip) == ("average", 1.0, None)
+    else:
+        assert 0 < config.likelihood_iterations < training.iterations
+        assert training.outer_step == "adam"
 
 
 def test_initial_parameters_have_the_sizes_of_the_settings(offline, playing) -> None:
