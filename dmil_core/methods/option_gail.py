@@ -29,7 +29,7 @@ What the sources leave open, and what is chosen here:
   the outer step goes to the slots' mean (``outer_step: average``), as in federated averaging (McMahan et al. 2017).
   Adam's moments start at 0 in each slot. The offline iterations are run in the same way.
 - *Pre-training.* How the appendix's authors pre-trained is not said; the original's 16 million steps are in the size
-  ``paper``, less than a thirtieth of them in ``quick``.
+  ``paper``, at most half a million of them in ``quick``.
 - *Test.* So many epochs of hard EM on the support set, each one step of Adam on all of it with fresh Viterbi labels.
   The discriminator and the critic rest: meta-testing tasks are not acted in before they are judged.
 """
