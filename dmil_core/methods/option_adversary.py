@@ -165,16 +165,16 @@ def aims_of(
 ) -> Aims:
     """Return what PPO goes by in a round.
 
-    `beyond` is each trajectory's state after its last step, where both levels are valued by V_H: the next option is
-    not yet drawn.
+    Values are of rewards less the round's mean. `beyond` is each trajectory's state after its last step, where both
+    levels are valued by V_H: the next option is not yet drawn.
     """
     ends = played.steps.lengths.cumsum(0) - 1
     last_values = high_values(parameters, beyond, played.options[ends], config).numpy()
-    scaled = (1 - config.discount) * rewards.numpy()
+    centred = (rewards - rewards.mean()).numpy()
     cuts = (ends[:-1] + 1).tolist()
 
     def advantages(values: np.ndarray) -> np.ndarray:
-        episodes = zip(np.split(scaled, cuts), np.split(values, cuts), last_values, strict=True)
+        episodes = zip(np.split(centred, cuts), np.split(values, cuts), last_values, strict=True)
         each = [
             generalised_advantages(of, np.append(value, last), config.discount, config.smoothing)
             for of, value, last in episodes

@@ -20,13 +20,16 @@ What the sources leave open, and what is chosen here:
   Each level has advantages of its own (`advantages`, which says why they are not RLlib's), standardised per round.
 - *Ends.* The reward is positive everywhere, so an episode cut off at its success would be worth less than one that
   never succeeds. Ends come from the protocol and not from the task: every episode is valued by V_H beyond its end.
-- *Scale.* Rewards are multiplied by 1 − γ, which changes no standardised advantage and keeps values near 1.
+- *Centre.* Rewards are taken less their mean over the round. As every episode goes on beyond its end, that changes no
+  true advantage, and it keeps values near 0, where the critic starts.
+- *Weight decay* is decoupled (Loshchilov & Hutter 2019): with moments that start at 0, an L2 term would move a weight
+  of little gradient at the full rate.
 - *Slots.* The original's epoch of 4,096 steps is an iteration here, its steps split over the tasks of its slots. A
   slot takes its own steps of Adam from where the iteration starts and returns the way, parameters before minus after;
   the outer step goes to the slots' mean (``outer_step: average``), as in federated averaging (McMahan et al. 2017).
   Adam's moments start at 0 in each slot. The offline iterations are run in the same way.
 - *Pre-training.* How the appendix's authors pre-trained is not said; the original's 16 million steps are in the size
-  ``paper``, less than a thirtieth of them in ``quick``.
+  ``paper``, at most half a million of them in ``quick``.
 - *Test.* So many epochs of hard EM on the support set, each one step of Adam on all of it with fresh Viterbi labels.
   The discriminator and the critic rest: meta-testing tasks are not acted in before they are judged.
 """

@@ -25,7 +25,7 @@ class OptionConfig(HierarchicalConfig):
     """Lower bound of log σ of an option's actions; the upper one is 0."""
     trajectories: Size = 16
     """Whole demonstrations of a slot's task that it learns from (Table 9)."""
-    likelihood_iterations: Iterations = 1000
+    likelihood_iterations: Iterations = 250
     """So many iterations go up the likelihood, before those of hard EM."""
 
 
@@ -43,9 +43,8 @@ class OptionGailOfflineConfig(OptionConfig):
                 "hidden_units": 256,
                 "output_scale": 0.07,
                 "trajectories": 4,
-                "likelihood_iterations": 1000,
+                "likelihood_iterations": 500,
             },
-            "training": {"iterations": 2000},
             "evaluation": {"learning_rate": 1e-3},
         },
         "smoke": {
@@ -60,9 +59,9 @@ class OptionGailConfig(OptionConfig):
 
     name: Literal["option-gail"] = "option-gail"
     """The method."""
-    likelihood_iterations: Iterations = 250
+    likelihood_iterations: Iterations = 60
     """So many iterations go up the likelihood, before the other offline ones, which are of hard EM."""
-    offline_iterations: Iterations = 500
+    offline_iterations: Iterations = 400
     """Iterations before the adversarial ones."""
     offline_steps: Count = 10
     """A slot's own steps of Adam in an offline iteration, each on all that it drew."""
@@ -95,7 +94,7 @@ class OptionGailConfig(OptionConfig):
 
     sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "paper": {
-            "training": {"iterations": 4500, "outer_step": "average", "learning_rate": 1.0},
+            "training": {"iterations": 4400, "outer_step": "average", "learning_rate": 1.0},
             "evaluation": {"learning_rate": 3e-4},
         },
         "quick": {
@@ -105,12 +104,12 @@ class OptionGailConfig(OptionConfig):
                 "output_scale": 0.07,
                 "least_log_deviation": -2.0,
                 "trajectories": 4,
-                "likelihood_iterations": 50,
-                "offline_iterations": 100,
+                "likelihood_iterations": 30,
+                "offline_iterations": 250,
                 "environment_steps": 500,
             },
             "training": {
-                "iterations": 200,
+                "iterations": 350,
                 "outer_step": "average",
                 "learning_rate": 1.0,
                 "gradient_clip": None,

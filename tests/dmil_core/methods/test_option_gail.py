@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch.distributions import Normal
 
-from dmil_core.configs import TrainingConfig
+from dmil_core.configs import SIZES, EvaluationConfig, TrainingConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.losses import Steps
-from dmil_core.methods.base import FineTuning, MetaLearner, PractisingLearner, Rollout
+from dmil_core.methods.base import FineTuning, MetaLearner, Policy, PractisingLearner, Rollout
 from dmil_core.methods.option_adversary import (
     Aims,
     Played,
@@ -105,6 +105,23 @@ def test_they_are_what_their_types_say(offline, playing) -> None:
     assert isinstance(offline, MetaLearner)
     assert not isinstance(offline, PractisingLearner)
     assert isinstance(playing, PractisingLearner)
+
+
+@pytest.mark.parametrize("size", ["paper", "quick", "smoke"])
+@pytest.mark.parametrize("config_type", [OptionGailOfflineConfig, OptionGailConfig])
+def test_every_size_has_all_of_its_phases(config_type, size: str) -> None:
+    own = config_type.sizes[size]
+    config = config_type(**own.get("method", {}))
+    common = SIZES[size]
+    training = TrainingConfig(**common.training.model_dump() | own.get("training", {}))
+    EvaluationConfig(**common.evaluation.model_dump() | own["evaluation"])
+    assert training.iterations % training.checkpoint_every == 0
+    if isinstance(config, OptionGailConfig):
+        assert 0 < config.likelihood_iterations < config.offline_iterations < training.iterations
+        assert (training.outer_step, training.learning_rate, training.gradient_clip) == ("average", 1.0, None)
+    else:
+        assert 0 < config.likelihood_iterations < training.iterations
+        assert training.outer_step == "adam"
 
 
 def test_initial_parameters_have_the_sizes_of_the_settings(offline, playing) -> None:
@@ -426,7 +443,7 @@ def test_aims_follow_from_the_values_of_both_levels(playing, played, rollouts) -
         each = []
         for first, end, after in ((0, 5, last[0]), (5, 6, last[1]), (6, 9, last[2])):
             later = torch.cat([values[first + 1 : end], after[None]])
-            errors = (1 - discount) * rewards[first:end] + discount * later - values[first:end]
+            errors = (rewards - rewards.mean())[first:end] + discount * later - values[first:end]
             each += [sum(both**n * error for n, error in enumerate(errors[t:])) for t in range(end - first)]
         return torch.stack(each)
 
@@ -514,3 +531,38 @@ def test_tells_two_skills_apart_in_a_new_task_offline() -> None:
     assert recovered(skills, [policy.sub_skill_use(one).chosen for one in demonstrations]) >= 0.95
     successes = [rollout.success for rollout in practise(policy, "task-101", 5, 10 * STEPS)]
     assert np.mean(successes) >= 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
+def test_practice_against_the_discriminator_makes_more_of_a_poor_start() -> None:
+    sets = {"task-0": training_sets(1)["task-0"]}
+    config = OptionGailConfig(
+        sub_skills=2,
+        hidden_layers=1,
+        hidden_units=32,
+        output_scale=0.1,
+        least_log_deviation=-1.5,
+        trajectories=8,
+        likelihood_iterations=0,
+        offline_iterations=40,
+        offline_steps=5,
+        offline_learning_rate=1e-2,
+        environment_steps=10 * STEPS,
+        policy_epochs=4,
+        discriminator_passes=4,
+        discriminator_units=32,
+        critic_units=32,
+    )
+    method = OptionGail.prepared(config, 2, sets["task-0"])
+    training = TrainingConfig(iterations=64, tasks_per_iteration=2, outer_step="average", learning_rate=1.0)
+    successes: list[float] = []
+
+    def watched(policy: Policy, task: str, seed: int, steps: int) -> list[Rollout]:
+        rollouts = practise(policy, task, seed, steps)
+        successes.append(float(np.mean([rollout.success for rollout in rollouts])))
+        return rollouts
+
+    meta_trained(method, sets, training, watched)
+    assert len(successes) == 2 * 24
+    assert np.mean(successes[16:]) > np.mean(successes[:16]) + 0.1

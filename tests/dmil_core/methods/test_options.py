@@ -83,7 +83,8 @@ def test_posteriors_are_the_shares_of_all_sequences(case) -> None:
 
 def test_weights_of_the_posterior_give_the_gradient_of_the_likelihood() -> None:
     high, low = (scores.requires_grad_() for scores in draw_scores(0, 3, sum(RAGGED)))
-    brute = sum(torch.stack(list(every_sequence(*of).values())).logsumexp(0) for of in trajectories(high, low, RAGGED))
+    each = [torch.stack(list(every_sequence(*of).values())).logsumexp(0) for of in trajectories(high, low, RAGGED)]
+    brute = torch.stack(each).sum()
     expected = torch.autograd.grad(brute, [high, low])
     chain = Chain.of(high, low, torch.tensor(RAGGED))
     by_forward = torch.autograd.grad(log_likelihood(chain).sum(), [high, low])
