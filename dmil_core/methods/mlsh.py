@@ -48,7 +48,7 @@ from dmil_core.meta_gradient import TaskGradient
 from dmil_core.methods.base import Decision, FineTuning, Standardised, SubSkillUse
 from dmil_core.methods.macro_steps import MacroSteps, draw_batch, macro_steps
 from dmil_core.methods.mlsh_config import MlshConfig
-from dmil_core.methods.ppo import clipped_surrogate, generalised_advantages, scaled, standardised
+from dmil_core.methods.ppo import clipped_surrogate, scaled, standardised, trajectory_advantages
 from dmil_core.networks import Layer, Network, Parameters, bank, flatten, initialise, mlp, network, own_states
 from dmil_core.seeding import stream
 
@@ -217,7 +217,7 @@ class _Task:
         self, rewards: Float[Tensor, " draws"], values: Float[Tensor, " draws"], lengths: Int[Tensor, " trajectories"]
     ) -> _Outcome:
         config = self.config
-        advantages = generalised_advantages(scaled(rewards), values, lengths, config.discount, config.trace)
+        advantages = trajectory_advantages(scaled(rewards), values, lengths, config.discount, config.trace)
         return _Outcome(standardised(advantages), advantages + values)
 
     def _log_densities(

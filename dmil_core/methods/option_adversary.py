@@ -15,10 +15,10 @@ from torch.nn import functional
 
 from dmil_core.demonstrations import Standardisation
 from dmil_core.losses import Steps
-from dmil_core.methods.advantages import clipped_surrogate, generalised_advantages
 from dmil_core.methods.base import Rollout
 from dmil_core.methods.option_gail_config import OptionGailConfig
 from dmil_core.methods.options import OptionModel, options_before
+from dmil_core.methods.ppo import clipped_surrogate, generalised_advantages
 from dmil_core.networks import Parameters, mlp, network
 
 __all__ = [

@@ -17,7 +17,7 @@ What the sources leave open, and what is chosen here:
 
 - *Levels.* As in DAC (Zhang & Whiteson 2019), the two levels are two decision processes on one trajectory: the high
   one decides in (s_t, o_{t−1}), the low one in (s_t, o_t). A critic gives V_L(s, o); V_H(s, o') = Σ_o π_H(o|s,o') V_L.
-  Each level has advantages of its own (`advantages`, which says why they are not RLlib's), standardised per round.
+  Each level has advantages of its own (`ppo`, which says why they are not RLlib's), standardised per round.
 - *Ends.* The reward is positive everywhere, so an episode cut off at its success would be worth less than one that
   never succeeds. Ends come from the protocol and not from the task: every episode is valued by V_H beyond its end.
 - *Centre.* Rewards are taken less their mean over the round. As every episode goes on beyond its end, that changes no

@@ -1,10 +1,18 @@
-"""Proximal policy optimisation (Schulman et al. 2017) as pure functions of log-probabilities, rewards and values."""
+"""What proximal policy optimisation is made of: generalised advantages and the clipped surrogate.
 
+RLlib has both, in ``ray.rllib.utils.postprocessing.value_predictions`` and inside its PPO learner. Its loss works on
+RLlib's own batches, modules and connectors, and knows one level of decisions where an option policy has two, each with
+advantages of its own; and the science does without Ray. So these are functions of our own; a test holds the advantages
+against RLlib's.
+"""
+
+import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.signal import lfilter
 from torch import Tensor
 
-__all__ = ["clipped_surrogate", "generalised_advantages", "scaled", "standardised"]
+__all__ = ["clipped_surrogate", "generalised_advantages", "scaled", "standardised", "trajectory_advantages"]
 
 SMALLEST = 1e-8
 """Stands in for a spread of zero."""
@@ -25,35 +33,44 @@ def clipped_surrogate(
 
 
 def generalised_advantages(
+    rewards: Float[np.ndarray, " steps"], values: Float[np.ndarray, " steps+1"], discount: float, trace: float
+) -> Float[np.ndarray, " steps"]:
+    """Return A_t = Σ_l (γλ)^l δ_{t+l}, δ_t = r_t + γ V_{t+1} − V_t (Schulman et al. 2016), of one episode.
+
+    Args:
+        rewards: of each step.
+        values: V of each state, and of the one after the last step; 0 where there is no going on.
+        discount: γ.
+        trace: λ.
+    """
+    errors = rewards + discount * values[1:] - values[:-1]
+    return np.asarray(lfilter([1.0], [1.0, -discount * trace], errors[::-1]))[::-1].copy()
+
+
+def trajectory_advantages(
     rewards: Float[Tensor, " draws"],
     values: Float[Tensor, " draws"],
     lengths: Int[Tensor, " trajectories"],
     discount: float,
     trace: float,
 ) -> Float[Tensor, " draws"]:
-    """Return A_t = Σ_i (γλ)^i δ_{t+i}, δ_t = r_t + γ V_{t+1} − V_t, within each trajectory (Schulman et al. 2016).
-
-    After a trajectory's end there is nothing: V = 0. With γ = 0 it is r − V.
+    """Return the `generalised_advantages` within each trajectory, after whose end there is nothing: V = 0.
 
     Args:
         rewards: of trajectories one after the other.
         values: V of the same draws.
         lengths: of the trajectories.
-        discount: γ.
+        discount: γ; with 0 they are r − V.
         trace: λ.
     """
     if not discount:
         return rewards - values
-    longest = int(lengths.max())
-    within = torch.arange(longest) < lengths[:, None]
-    reward, value = (
-        torch.zeros(within.shape, dtype=rewards.dtype).masked_scatter(within, t) for t in (rewards, values)
-    )
-    following = torch.cat([value[:, 1:], torch.zeros_like(value[:, :1])], 1)
-    advantages = reward + discount * following - value
-    for step in reversed(range(longest - 1)):
-        advantages[:, step] += discount * trace * advantages[:, step + 1]
-    return advantages[within]
+    cuts = lengths.tolist()
+    each = [
+        generalised_advantages(reward.numpy(), np.append(value.numpy(), 0.0), discount, trace)
+        for reward, value in zip(rewards.split(cuts), values.split(cuts), strict=True)
+    ]
+    return torch.from_numpy(np.concatenate(each)).to(rewards.dtype)
 
 
 def scaled(rewards: Float[Tensor, " draws"]) -> Float[Tensor, " draws"]:

@@ -15,7 +15,7 @@ from dmil_core.methods.base import FineTuning, MetaLearner
 from dmil_core.methods.macro_steps import draw_batch, macro_steps
 from dmil_core.methods.mlsh import Mlsh, MlshPolicy
 from dmil_core.methods.mlsh_config import MlshConfig
-from dmil_core.methods.ppo import clipped_surrogate, generalised_advantages, scaled, standardised
+from dmil_core.methods.ppo import clipped_surrogate, scaled, standardised, trajectory_advantages
 from dmil_core.networks import flatten, mlp, unflatten
 from dmil_core.seeding import stream
 from tests.dmil_core.methods.toys import meta_trained, record, recovered, training_sets
@@ -89,32 +89,6 @@ def test_a_batch_is_whole_trajectories_in_turn_and_one_cut_off(lengths: list[int
 # PPO
 
 
-@pytest.mark.parametrize(
-    ("ratio", "advantage", "value", "slope"),
-    [
-        (1.0, 2.0, 2.0, 2.0),
-        (1.01, 2.0, 2.02, 2.0),
-        (1.5, 2.0, 2.04, 0.0),  # good, and more probable than the clip allows
-        (0.5, 2.0, 1.0, 2.0),  # good, and to be made more probable again
-        (0.5, -2.0, -1.96, 0.0),  # bad, and less probable than the clip allows
-        (1.5, -2.0, -3.0, -2.0),  # bad, and to be made less probable again
-    ],
-)
-def test_the_clipped_surrogate_is_flat_where_it_clips(
-    ratio: float, advantage: float, value: float, slope: float
-) -> None:
-    log_ratio = torch.tensor([ratio], dtype=torch.float64).log().requires_grad_()
-    found = clipped_surrogate(log_ratio, torch.tensor([advantage], dtype=torch.float64), 0.02)
-    (gradient,) = torch.autograd.grad(found, log_ratio)
-    assert found.item() == pytest.approx(value)
-    assert gradient.item() == pytest.approx(slope * ratio)  # dρ / d log ρ = ρ
-
-
-def test_the_surrogate_is_the_mean_over_draws() -> None:
-    log_ratio, advantages = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([1.0, -4.0, 6.0])
-    assert clipped_surrogate(log_ratio, advantages, 0.5).item() == pytest.approx((1 - 4 + 9) / 3)
-
-
 @pytest.mark.parametrize("discount", [0.0, 0.5, 0.99])
 @pytest.mark.parametrize("trace", [0.0, 0.9])
 def test_advantages_are_the_discounted_sums_of_surprises(discount: float, trace: float) -> None:
@@ -130,7 +104,7 @@ def test_advantages_are_the_discounted_sums_of_surprises(discount: float, trace:
             for t in range(length)
         ]
         start += length
-    found = generalised_advantages(
+    found = trajectory_advantages(
         torch.from_numpy(rewards), torch.from_numpy(values), torch.tensor(lengths), discount, trace
     )
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-12)

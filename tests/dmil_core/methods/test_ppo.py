@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from dmil_core.methods.advantages import clipped_surrogate, generalised_advantages
+from dmil_core.methods.ppo import clipped_surrogate, generalised_advantages
 
 
 @pytest.mark.parametrize("steps", [1, 2, 7])
