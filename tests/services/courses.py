@@ -1,9 +1,11 @@
 """What tests of meta-training share: a small plan, and its course from one state to the next, seen from outside."""
 
+import os
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import ray
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.networks import flatten
@@ -57,6 +59,11 @@ def follow(
         course.states.append(training.state())
         disturb(iteration.number)
     return course
+
+
+def pid_of(actor: Any) -> int:
+    """Return the process of one of Ray's actors."""
+    return ray.get(actor.__ray_call__.remote(lambda worker: os.getpid()))
 
 
 def alone(experiment: Experiment, data) -> Course:

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-import ray
 from ray.cluster_utils import Cluster as Nodes
 
 from dmil_core.configs import ExperimentConfig
@@ -28,7 +27,7 @@ from services.failures import read_failure
 from services.ray_meta_training import RayMetaTraining
 from services.runners import LocalRunner
 from services.suites.base import Attempt
-from tests.services.courses import ITERATIONS, alone, assert_same_bits, follow, plan_of, training
+from tests.services.courses import ITERATIONS, alone, assert_same_bits, follow, pid_of, plan_of, training
 
 SLOTS = 5
 
@@ -36,10 +35,6 @@ SLOTS = 5
 @pytest.fixture
 def small(config: ExperimentConfig, store: DemoStore) -> Experiment:
     return Experiment(training(config, SLOTS, 1), store)
-
-
-def pid_of(actor) -> int:
-    return ray.get(actor.__ray_call__.remote(lambda worker: os.getpid()))
 
 
 # Killed and hung

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -31,9 +32,10 @@ from services.actors.simulation import SimulationWorker
 from services.checkpoints import Checkpoint, Checkpoints
 from services.demo_store import DemoStore
 from services.experiment import Experiment, open_runner
+from services.ray_meta_training import RayMetaTraining
 from services.results import EpisodeResult, read_rows
 from tests.services.conftest import QUICK_EVALUATION
-from tests.services.courses import alone, assert_same_bits, follow, plan_of
+from tests.services.courses import alone, assert_same_bits, follow, pid_of, plan_of
 
 PROJECT = Path(__file__).parents[2]
 LEARNERS = [name for name, kind in OURS.items() if issubclass(kind, MetaLearner)]
@@ -48,13 +50,42 @@ def smoke(method: str, iterations: int) -> ExperimentConfig:
 @pytest.mark.slow
 @pytest.mark.usefixtures("joined")
 @pytest.mark.parametrize("method", LEARNERS)
-def test_any_number_of_workers_ends_with_the_same_bits(store: DemoStore, data, method: str):
+def test_here_and_on_workers_that_are_killed_the_same_bits_come_out(store: DemoStore, data, method: str):
     experiment = Experiment(smoke(method, 4), store)
     wanted = alone(experiment, data)
     assert np.isfinite(wanted.states[-1].parameters).all()
     assert any(map(np.not_equal, wanted.states[-1].parameters, wanted.states[0].parameters))
+    steps = [slot.get("environment_steps", 0) for slots in wanted.slots for slot in slots]
+    assert any(steps) == (method in PRACTISING)
     with open_runner("ray", experiment.suite, 2) as runner:
-        assert_same_bits(follow(runner.meta_train(plan_of(experiment, data))), wanted)
+        meta_training = runner.meta_train(plan_of(experiment, data))
+        assert isinstance(meta_training, RayMetaTraining)
+
+        def strike(done: int) -> None:
+            if done == 2:
+                os.kill(pid_of(meta_training._pool._workers[0].actor), signal.SIGKILL)
+
+        assert_same_bits(follow(meta_training, disturb=strike), wanted)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", PRACTISING)
+def test_a_killed_run_that_practises_goes_on_to_the_same_bits(programs, wait_for, workplace: Path, method: str):
+    settings = ("--method", method, "--preset", "smoke", "--runner", "local", *QUICK_EVALUATION)
+    begin = (*settings, "--training.checkpoint-every", "2")
+    program = programs.start("meta_train", *begin, "--name", "killed", "--training.iterations", "100000")
+    checkpoints = Checkpoints(workplace / "runs" / "killed" / "checkpoints", 3)
+    wait_for(lambda: len(checkpoints.all()) == 3 or program.poll() is not None, "the third checkpoint")
+    os.kill(program.pid, signal.SIGKILL)
+    program.communicate(timeout=60)
+    done = checkpoints.newest().manifest
+    assert done.environment_steps > 0
+    until = ("--training.iterations", str(done.iteration + 3))
+    meta_train.run(["--resume", "killed", "--runner", "local", *until])
+    meta_train.run([*begin, "--name", "whole", *until])
+    states = [Checkpoints(workplace / "runs" / name / "checkpoints", 1).newest() for name in ("killed", "whole")]
+    assert states[0].digest == states[1].digest
+    assert states[0].manifest.environment_steps == states[1].manifest.environment_steps
 
 
 @pytest.mark.slow
