@@ -37,7 +37,7 @@ class MethodConfig(Settings):
     """Base of a method's own settings."""
 
     name: Any
-    """The method: a literal of each one's own."""
+    """The method."""
     standardise: bool = True
     """Standardise observations by the statistics of the meta-training demonstrations."""
 

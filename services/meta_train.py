@@ -43,7 +43,7 @@ class Arguments:
 
     experiment: Annotated[ExperimentConfig, tyro.conf.arg(name="")]
     preset: str = DEFAULT_PRESET
-    """Settings to begin with: quick (some minutes on two cores), paper (Table 9 to the letter) or smoke (a minute);
+    """Settings to begin with: quick (some minutes on two cores), paper (its tables to the letter) or smoke (a minute);
     also with the suite's name before, as ml10-quick."""
     suite: str | None = None
     """The suite, as ml10, ml45, ML1-reach, push-around-wall or kitchen; short for --suite.name."""
