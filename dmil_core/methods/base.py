@@ -28,6 +28,8 @@ __all__ = [
     "Decision",
     "Drawn",
     "FineTuning",
+    "Flat",
+    "Memoryless",
     "MetaLearner",
     "Method",
     "Policy",
@@ -35,7 +37,6 @@ __all__ = [
     "Rollout",
     "Standardised",
     "SubSkillUse",
-    "no_sub_skills",
 ]
 
 
@@ -69,12 +70,6 @@ class SubSkillUse(NamedTuple):
     best: Int64[np.ndarray, " steps"]
 
 
-def no_sub_skills(demonstration: Demonstration) -> SubSkillUse:
-    """Return what a method without sub-skills says of a demonstration: sub-skill 0 throughout."""
-    none = np.zeros(len(demonstration), np.int64)
-    return SubSkillUse(none, none)
-
-
 @runtime_checkable
 class Policy(Protocol):
     """A policy adapted to one task, acting in several episodes in lockstep.
@@ -96,6 +91,23 @@ class Policy(Protocol):
     def sub_skill_use(self, demonstration: Demonstration) -> SubSkillUse:
         """Return the sub-skills along a demonstration; a method without sub-skills reports sub-skill 0."""
         ...
+
+
+class Memoryless:
+    """Base of policies whose choice depends on the state alone."""
+
+    def start(self, episodes: int) -> Int64[np.ndarray, "episodes 0"]:
+        """Return an empty memory."""
+        return np.zeros((episodes, 0), np.int64)
+
+
+class Flat(Memoryless):
+    """Base of such policies without sub-skills."""
+
+    def sub_skill_use(self, demonstration: Demonstration) -> SubSkillUse:
+        """Return sub-skill 0 throughout: there are no others."""
+        none = np.zeros(len(demonstration), np.int64)
+        return SubSkillUse(none, none)
 
 
 class FineTuning(NamedTuple):

@@ -22,7 +22,7 @@ from jaxtyping import Float32, Int64
 from dmil_core.demonstrations import Demonstration, Standardisation, TaskBatch, sample_task_batch
 from dmil_core.losses import Steps, behaviour_cloning_loss
 from dmil_core.meta_gradient import TaskGradient
-from dmil_core.methods.base import Decision, FineTuning, Standardised, SubSkillUse, no_sub_skills
+from dmil_core.methods.base import Decision, FineTuning, Flat, Standardised
 from dmil_core.networks import Layer, Network, Parameters, initialise, mlp, network, unflatten
 from dmil_core.settings import Count, MethodConfig, Positive, Size
 from dmil_core.slopes import slope
@@ -83,15 +83,11 @@ class PerTaskConfig(_NetworkConfig):
 
 
 @dataclass(frozen=True)
-class NetworkPolicy:
+class NetworkPolicy(Flat):
     """One network acts: a = π(s)."""
 
     network: Network
     standardise: Standardisation
-
-    def start(self, episodes: int) -> Int64[np.ndarray, "episodes 0"]:
-        """Return an empty memory: the action depends on the state alone."""
-        return np.zeros((episodes, 0), np.int64)
 
     def act(
         self, observations: Float32[np.ndarray, "episodes obs_dim"], memory: Int64[np.ndarray, "episodes 0"]
@@ -99,10 +95,6 @@ class NetworkPolicy:
         """Choose one action for each episode."""
         actions = mlp(self.network, torch.from_numpy(self.standardise(observations)))
         return Decision(actions.numpy(), np.zeros(len(observations), np.int64), memory)
-
-    def sub_skill_use(self, demonstration: Demonstration) -> SubSkillUse:
-        """Return sub-skill 0: there are none."""
-        return no_sub_skills(demonstration)
 
 
 def fine_tuned(policy: Network, steps: Steps, optimiser: type[torch.optim.Optimizer], tuning: FineTuning) -> Network:

@@ -21,22 +21,18 @@ from dmil_core.demonstrations import Demonstration, Standardisation, TaskBatch, 
 from dmil_core.dmil_config import DmilConfig
 from dmil_core.losses import Steps
 from dmil_core.meta_gradient import TaskGradient
-from dmil_core.methods.base import Decision, FineTuning, Standardised, SubSkillUse
+from dmil_core.methods.base import Decision, FineTuning, Memoryless, Standardised, SubSkillUse
 from dmil_core.networks import Parameters, initialise
 
 __all__ = ["Dmil", "DmilPolicy"]
 
 
 @dataclass(frozen=True)
-class DmilPolicy:
+class DmilPolicy(Memoryless):
     """The most probable sub-skill acts: a = π_k(s), k = argmax π_h(s)."""
 
     hierarchy: Hierarchy
     standardise: Standardisation
-
-    def start(self, episodes: int) -> Int64[np.ndarray, "episodes 0"]:
-        """Return an empty memory: the choice depends on the state alone."""
-        return np.zeros((episodes, 0), np.int64)
 
     def act(
         self, observations: Float32[np.ndarray, "episodes obs_dim"], memory: Int64[np.ndarray, "episodes 0"]

@@ -43,7 +43,7 @@ from jaxtyping import Float32, Int64
 from dmil_core.demonstrations import Demonstration, DemonstrationError, Standardisation
 from dmil_core.meta_gradient import TaskGradient
 from dmil_core.methods import transformer
-from dmil_core.methods.base import Decision, FineTuning, Standardised, SubSkillUse, no_sub_skills
+from dmil_core.methods.base import Decision, FineTuning, Flat, Standardised
 from dmil_core.methods.mil_config import MilConfig
 from dmil_core.methods.mil_learning import Pairs, Support, adapted, outer_gradient
 from dmil_core.methods.transformer import Cache, Sizes, cached, decode, encode
@@ -71,16 +71,12 @@ class MilBatch:
 
 
 @dataclass(frozen=True)
-class MilPolicy:
+class MilPolicy(Flat):
     """The decoder acts, with the adapted encoder's view of the support set at hand: a = f_θ'(s | D)."""
 
     parameters: Parameters
     cache: Cache
     standardise: Standardisation
-
-    def start(self, episodes: int) -> Int64[np.ndarray, "episodes 0"]:
-        """Return an empty memory: the action depends on the state and the support set alone."""
-        return np.zeros((episodes, 0), np.int64)
 
     def act(
         self, observations: Float32[np.ndarray, "episodes obs_dim"], memory: Int64[np.ndarray, "episodes 0"]
@@ -88,10 +84,6 @@ class MilPolicy:
         """Choose one action for each episode."""
         actions = decode(self.parameters, torch.from_numpy(self.standardise(observations)), self.cache)
         return Decision(actions.numpy(), np.zeros(len(observations), np.int64), memory)
-
-    def sub_skill_use(self, demonstration: Demonstration) -> SubSkillUse:
-        """Return sub-skill 0: there are none."""
-        return no_sub_skills(demonstration)
 
 
 @dataclass(frozen=True)

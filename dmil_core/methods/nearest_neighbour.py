@@ -16,7 +16,7 @@ from jaxtyping import Float32, Int64
 
 from dmil_core.demonstrations import Demonstration, Standardisation
 from dmil_core.losses import Steps
-from dmil_core.methods.base import Decision, FineTuning, Standardised, SubSkillUse, no_sub_skills
+from dmil_core.methods.base import Decision, FineTuning, Flat, Standardised
 from dmil_core.networks import Parameters
 from dmil_core.settings import MethodConfig
 
@@ -35,15 +35,11 @@ class NearestNeighbourConfig(MethodConfig):
 
 
 @dataclass(frozen=True)
-class NearestNeighbourPolicy:
+class NearestNeighbourPolicy(Flat):
     """Does what was done in the nearest state of the support set, the first of equally near ones."""
 
     support: Steps
     standardise: Standardisation
-
-    def start(self, episodes: int) -> Int64[np.ndarray, "episodes 0"]:
-        """Return an empty memory: the action depends on the state alone."""
-        return np.zeros((episodes, 0), np.int64)
 
     def act(
         self, observations: Float32[np.ndarray, "episodes obs_dim"], memory: Int64[np.ndarray, "episodes 0"]
@@ -52,10 +48,6 @@ class NearestNeighbourPolicy:
         states = torch.from_numpy(self.standardise(observations))
         nearest = torch.cdist(states, self.support.states, compute_mode="donot_use_mm_for_euclid_dist").argmin(1)
         return Decision(self.support.actions[nearest].numpy(), np.zeros(len(observations), np.int64), memory)
-
-    def sub_skill_use(self, demonstration: Demonstration) -> SubSkillUse:
-        """Return sub-skill 0: there are none."""
-        return no_sub_skills(demonstration)
 
 
 class NearestNeighbour(Standardised[NearestNeighbourConfig]):

@@ -16,12 +16,11 @@ from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import (
     Decision,
     FineTuning,
+    Flat,
     MetaLearner,
     Policy,
     PractisingLearner,
     Rollout,
-    SubSkillUse,
-    no_sub_skills,
 )
 from dmil_core.methods.behaviour_cloning import NetworkPolicy
 from dmil_core.methods.registry import OURS, method_type
@@ -187,7 +186,7 @@ def test_practice_is_a_pure_function_that_takes_its_steps(experiment: Experiment
     assert not np.array_equal(found[0][0].observations, found[0][1].observations)
 
 
-class Replay:
+class Replay(Flat):
     """Does what a demonstration did."""
 
     def __init__(self, demonstration: Demonstration) -> None:
@@ -199,9 +198,6 @@ class Replay:
     def act(self, observations: np.ndarray, memory: np.ndarray) -> Decision:
         steps = np.minimum(memory[:, 0], len(self.actions) - 1)
         return Decision(self.actions[steps], np.zeros(len(memory), np.int64), memory + 1)
-
-    def sub_skill_use(self, demonstration: Demonstration) -> SubSkillUse:
-        return no_sub_skills(demonstration)
 
 
 def test_practice_ends_an_episode_at_its_success(experiment: Experiment, data):
