@@ -31,8 +31,8 @@ test: setup ## lint, format, types, then every test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
-	$(BIN)/python -m pytest -m "not alone" -n 2 --dist loadfile
-	$(BIN)/python -m pytest -m alone
+	$(BIN)/python -m pytest -m "not alone" -n 2 --dist loadfile --durations 10
+	$(BIN)/python -m pytest -m alone --durations 20
 
 audit: setup ## ask PyPI for known vulnerabilities of every pinned dependency; options go in ARGS, as ARGS="-s osv"
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[audit]'
