@@ -11,7 +11,7 @@ import torch
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import RunError, UserError
-from dmil_core.methods.base import MetaLearner, Method, Standardised
+from dmil_core.methods.base import MetaLearner, Method, PractisingLearner, Standardised
 from dmil_core.methods.registry import method_type
 from dmil_core.networks import Parameters, flatten, unflatten
 from dmil_core.outer_loop import OuterState
@@ -237,7 +237,8 @@ class Experiment:
             return resume or Checkpoint(save(state, None))
         assert isinstance(method, MetaLearner)
         skip = on_nonfinite == "skip"
-        plan = Plan(method, shapes, sets, state, settings, self.config.seed, skip, self.suite)
+        suite = self.suite if isinstance(method, PractisingLearner) else None  # takes a worker seconds to import
+        plan = Plan(method, shapes, sets, state, settings, self.config.seed, skip, suite)
         training = runner.meta_train(plan)
         collapse = CollapseWatch()
         losses: list[float] = []

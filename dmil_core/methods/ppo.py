@@ -9,7 +9,6 @@ against RLlib's.
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.signal import lfilter
 from torch import Tensor
 
 __all__ = ["clipped_surrogate", "generalised_advantages", "scaled", "standardised", "trajectory_advantages"]
@@ -43,8 +42,10 @@ def generalised_advantages(
         discount: γ.
         trace: λ.
     """
-    errors = rewards + discount * values[1:] - values[:-1]
-    return np.asarray(lfilter([1.0], [1.0, -discount * trace], errors[::-1]))[::-1].copy()
+    advantages = rewards + discount * values[1:] - values[:-1]
+    for step in reversed(range(len(advantages) - 1)):
+        advantages[step] += discount * trace * advantages[step + 1]
+    return advantages
 
 
 def trajectory_advantages(
