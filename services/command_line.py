@@ -21,6 +21,7 @@ from dmil_core.configs import (
     preset_of,
 )
 from dmil_core.errors import RunError, UserError, explain, shown
+from dmil_core.methods.registry import MethodError
 from services.settings_files import ConfigError, merged, read_yaml
 
 __all__ = [
@@ -86,6 +87,8 @@ def config_from(
         settings = preset_of(suite or named or DEFAULT_SUITE, size, method or method_named(given)).model_dump()
     except ValidationError as error:
         raise _no_name(suite) from error
+    except MethodError as error:
+        raise ConfigError(str(error) if file is None or method is not None else f"{file}: {error}") from error
     settings = merged(settings, given, str(file))
     if method is not None:
         settings["method"]["name"] = method

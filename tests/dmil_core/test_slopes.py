@@ -161,13 +161,14 @@ def test_descend_takes_one_step_and_leaves_the_network(problem, plain_mlp, dtype
     assert torch.equal(flat(problem.network), before)
 
 
-def test_descend_in_place_overwrites_the_networks_own_tensors(problem) -> None:
+def test_descend_in_place_overwrites_the_networks_own_tensors(problem, dtype) -> None:
     got, own = problem.slope, list(itertools.chain(*problem.network))
     expected = flat(got.descend(RATE))
     stepped = got.descend(RATE, in_place=True)
     assert all(one is other for one, other in zip(itertools.chain(*stepped), own, strict=True))
-    assert torch.equal(flat(stepped), expected)
-    assert torch.equal(flat(problem.network), expected)
+    # Some processors' products with and without a place of their own differ in the last bits.
+    assert relative_error(flat(stepped), expected) <= TOLERANCE[dtype]
+    assert torch.equal(flat(problem.network), flat(stepped))
 
 
 def test_a_step_of_a_sub_skill_touches_its_row_of_the_bank_alone(make_parameters, make_steps) -> None:

@@ -228,6 +228,8 @@ def test_a_mistake_is_told_in_words(complaint, workplace: Path, arguments: tuple
 
 @pytest.mark.usefixtures("workplace")
 def test_settings_of_another_method_are_refused(complaint, workplace: Path):
+    Path("mine.yaml").write_text("method: {name: foo}\n")
+    assert "mine.yaml: method.name: got 'foo'; wanted one of dmil" in complaint(meta_train.run, "--config", "mine.yaml")
     Path("mine.yaml").write_text("method: {name: behaviour-cloning, sub_skills: 3}\n")
     printed = complaint(meta_train.run, "--config", "mine.yaml", "--preset", "smoke")
     assert "mine.yaml: got the unknown key method.sub_skills; wanted one of" in printed
