@@ -107,6 +107,8 @@ class OptionGailConfig(OptionConfig):
                 "likelihood_iterations": 30,
                 "offline_iterations": 250,
                 "environment_steps": 500,
+                "learning_rate": 3e-5,
+                "policy_epochs": 3,
             },
             "training": {
                 "iterations": 350,
