@@ -1,0 +1,103 @@
+"""Plots as inline SVG: legible in light and dark, with a text alternative, each sub-skill in one colour everywhere."""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import StringIO
+from itertools import count
+from typing import Any, NamedTuple
+
+import matplotlib
+
+matplotlib.use("Agg")
+from markupsafe import Markup, escape
+from matplotlib import pyplot
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+__all__ = ["Picture", "colour_of", "drawn", "panels", "style_of"]
+
+COLOURS = (
+    "#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#cc79a7", "#b8a900", "#882255", "#44aa99", "#999999",
+)  # fmt: skip
+"""Told apart by colour-blind eyes (Okabe and Ito 2008, with a darker yellow; the last three are Tol's)."""
+DASHES = ("solid", "dashed", "dotted", "dashdot")
+INK = "#010203"
+"""Stands for the page's own colour of text until the SVG is on the page."""
+STYLE = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "dmil",
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
+    "legend.framealpha": 0.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.2,
+    "font.size": 9.0,
+    "axes.titlesize": 10.0,
+    "figure.max_open_warning": 0,
+} | dict.fromkeys(
+    ("text.color", "axes.labelcolor", "axes.edgecolor", "axes.titlecolor", "xtick.color", "ytick.color", "grid.color"),
+    INK,
+)
+_numbers = count(1)
+
+
+class Picture(NamedTuple):
+    """A plot as it goes into a page."""
+
+    title: str
+    description: str
+    """What it shows, for whoever does not see it."""
+    svg: str
+
+
+def colour_of(index: int) -> str:
+    """Return the colour of a sub-skill, the same on every page; that of a line, where there are no sub-skills."""
+    return COLOURS[index % len(COLOURS)]
+
+
+def style_of(index: int) -> dict[str, Any]:
+    """Return how one of several lines is drawn: by colour, and where colours begin again by its dashes."""
+    return {"color": colour_of(index), "linestyle": DASHES[index // len(COLOURS) % len(DASHES)]}
+
+
+@contextmanager
+def panels(
+    rows: int = 1, columns: int = 1, *, width: float = 7.0, height: float = 3.0
+) -> Iterator[tuple[Figure, list[Axes]]]:
+    """Give a figure with a grid of axes, and forget it at the end.
+
+    Args:
+        rows: of the grid.
+        columns: of the grid.
+        width: of the whole figure, in inches of 72 points.
+        height: of the whole figure.
+    """
+    with pyplot.rc_context(STYLE):
+        figure, axes = pyplot.subplots(rows, columns, figsize=(width, height), layout="constrained", squeeze=False)
+        try:
+            yield figure, list(axes.flat)
+        finally:
+            pyplot.close(figure)
+
+
+def drawn(figure: Figure, title: str, description: str) -> Picture:
+    """Return a figure as inline SVG that has a size, a text alternative, and ids that no other picture has.
+
+    Args:
+        figure: from `panels`.
+        title: of the picture, a few words.
+        description: what it shows, in a sentence or two, with its main figures.
+    """
+    text = StringIO()
+    figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    svg = text.getvalue()
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
+    own = f"p{next(_numbers)}-"
+    svg = re.sub(r'(\bid="|xlink:href="#|url\(#)', rf"\g<1>{own}", svg).replace(INK, "currentColor")
+    head = f'role="img" aria-labelledby="{own}title {own}description"'
+    told = f'<title id="{own}title">{escape(title)}</title><desc id="{own}description">{escape(description)}</desc>'
+    return Picture(title, description, Markup(re.sub(r"<svg ([^>]*)>", rf"<svg {head} \1>" + told, svg, count=1)))

@@ -1,0 +1,99 @@
+"""A page as one file: headings, prose, tables that sort, pictures, videos; nothing in it comes from elsewhere."""
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from services.disk import write_file
+from services.reporting.drawing import Picture
+
+__all__ = ["Clip", "Commands", "DataTable", "Part", "Prose", "Section", "write_page"]
+
+TYPES = {".mp4": "video/mp4", ".gif": "image/gif"}
+
+
+@dataclass(frozen=True)
+class Prose:
+    """A paragraph."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Command lines, to be copied."""
+
+    caption: str
+    lines: Sequence[str]
+
+
+@dataclass(frozen=True)
+class DataTable:
+    """A table that sorts where its head is clicked; numbers sort as numbers, also those with more text behind them."""
+
+    caption: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str | int | float]]
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A video, which goes into the page as it is."""
+
+    caption: str
+    """What happens in it: its text alternative too."""
+    path: Path
+    """An MP4 or a GIF."""
+
+    @property
+    def type(self) -> str:
+        """Its media type."""
+        return TYPES[self.path.suffix]
+
+    @property
+    def address(self) -> str:
+        """All of it, as a data URL."""
+        return f"data:{self.type};base64,{base64.b64encode(self.path.read_bytes()).decode()}"
+
+
+Part = Prose | Commands | DataTable | Picture | Clip
+
+
+@dataclass(frozen=True)
+class Section:
+    """A chapter of a page."""
+
+    title: str
+    parts: Sequence[Part]
+    id: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        words = "".join(letter if letter.isalnum() else " " for letter in self.title.lower()).split()
+        object.__setattr__(self, "id", "-".join(words))
+
+
+def write_page(path: Path, title: str, lead: Sequence[Part], sections: Sequence[Section]) -> None:
+    """Write a page.
+
+    Args:
+        path: of the file.
+        title: of the page.
+        lead: what stands above all sections.
+        sections: in their order, with different titles; those without parts are left out.
+
+    Raises:
+        DiskFullError: for want of space; the file is then what it was.
+    """
+    templates = Environment(
+        loader=PackageLoader("services.reporting"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    templates.filters["kind"] = lambda part: type(part).__name__
+    kept = [section for section in sections if section.parts]
+    write_file(path, templates.get_template("page.html").render(title=title, lead=lead, sections=kept))
