@@ -24,7 +24,7 @@ COLOURS = (
 DASHES = ("solid", "dashed", "dotted", "dashdot")
 INK = "#010203"
 """Stands for the page's own colour of text until the SVG is on the page."""
-STYLE = {
+STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "dmil",
     "figure.facecolor": "none",
