@@ -13,7 +13,7 @@ from services.sweeps.folders import evaluated, trained
 from services.sweeps.settings import Range, Sweep, planned
 from services.tune_sweep import CONFIGS
 
-NAMES = ["bilevel", "continuity", "em", "finetune_steps", "kitchen_k", "methods", "search", "sub_skills"]
+NAMES = ["bilevel", "continuity", "em", "finetune_steps", "kitchen_k", "methods", "negatives", "search", "sub_skills"]
 SMALL = {"what": "a test", "suites": ["ml10"], "seeds": [0], "variants": {"one": {}}}
 
 
