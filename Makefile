@@ -4,10 +4,10 @@ BIN := .venv/bin
 INSTALLED := .venv/installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test audit clean
+.PHONY: help setup train cluster cluster-stop test audit clean
 
 help: ## list the targets
-	@sed -n 's/^\([a-z]*\):[^#]*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
+	@sed -n 's/^\([a-z-]*\):[^#]*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
 
 setup: $(INSTALLED) ## install the project and its pinned dependencies into .venv (once, and again when they change)
 
@@ -25,6 +25,12 @@ $(INSTALLED): pyproject.toml constraints.txt
 
 train: setup ## meta-train; its options go in ARGS: make train ARGS="--help"
 	$(BIN)/python -m services.meta_train $(ARGS)
+
+cluster: setup ## start a Ray head and an MLflow server on this machine, for Ray jobs; options go in ARGS
+	@$(BIN)/python -m services.local_cluster start $(ARGS)
+
+cluster-stop: setup ## stop these two
+	@$(BIN)/python -m services.local_cluster stop
 
 test: export OMP_NUM_THREADS = 1
 test: setup ## lint, format, types, then every test
