@@ -1,29 +1,85 @@
-"""The program as a Ray job: submitted from the project's root to a cluster that was started there."""
+"""The programs as Ray jobs: submitted from the project's root to a cluster that was started there."""
 
 import json
+import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from services.checkpoints import Checkpoints
+
 PROJECT = Path(__file__).parents[2]
+JOB = [sys.executable, "-m", "ray.scripts.scripts", "job"]
+
+
+@pytest.fixture
+def job(cluster, workplace: Path, store, mlflow_file: str) -> Callable[..., str]:
+    """Run `ray job`, from the project's root, and return what it prints."""
+
+    def run(do: str, *arguments: str) -> str:
+        command = [*JOB, do, "--address", cluster.dashboard, *arguments]
+        done = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, timeout=240)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    return run
+
+
+@pytest.fixture
+def submit(job: Callable[..., str], workplace: Path, store, mlflow_file: str) -> Callable[..., str]:
+    """Submit one of the programs; it writes into the test's own folder."""
+    environment = {"env_vars": {"DMIL_DATA": str(store.root), "MLFLOW_TRACKING_URI": mlflow_file}}
+
+    def run(name: str, program: str, *arguments: str, wait: bool = True) -> str:
+        settings = ["--runtime-env-json", json.dumps(environment), "--submission-id", name]
+        command = [sys.executable, "-m", f"services.{program}", *arguments, "--runs", str(workplace / "runs")]
+        return job("submit", *settings, *([] if wait else ["--no-wait"]), "--", *command)
+
+    return run
 
 
 @pytest.mark.slow
-def test_a_job_succeeds_and_leaves_nothing_in_the_checkout(cluster, workplace: Path, store, mlflow_file: str):
+def test_a_job_succeeds_and_leaves_nothing_in_the_checkout(submit, workplace: Path):
     before = {path.name for path in PROJECT.iterdir()}
-    environment = {"env_vars": {"DMIL_DATA": str(store.root), "MLFLOW_TRACKING_URI": mlflow_file}}
-    command = [
-        sys.executable, "-m", "ray.scripts.scripts", "job", "submit", "--address", cluster.dashboard,
-        "--runtime-env-json", json.dumps(environment), "--",
-        sys.executable, "-m", "services.meta_train", "--preset", "ml10-smoke",
-        "--runs", str(workplace / "runs"), "--name", "job",
-    ]  # fmt: skip
-    submitted = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, timeout=240)
-    assert submitted.returncode == 0, submitted.stdout + submitted.stderr
-    assert "succeeded" in submitted.stdout
+    assert "succeeded" in submit("whole", "meta_train", "--preset", "ml10-smoke", "--name", "job")
     summary = json.loads((workplace / "runs" / "job" / "summary.json").read_text())
     assert [row["episodes"] for row in summary["rows"]] == [6, 6, 2, 2]
     made = {path.name for path in PROJECT.iterdir()} - before
     assert not made & {"data", "runs", "mlflow.db", "mlartifacts"}
+
+
+@pytest.mark.slow
+def test_a_stopped_job_has_its_checkpoint_and_goes_on_to_the_same_bits(submit, job, train, wait_for, workplace: Path):
+    endless = ("--training.iterations", "100000", "--training.checkpoint-every", "50000")
+    submit("stopped", "meta_train", "--preset", "ml10-smoke", *endless, "--name", "job", wait=False)
+    progress = re.compile(r"^meta-training (\d+)/100000, ", re.MULTILINE)
+    wait_for(lambda: bool(progress.search(job("logs", "stopped"))), "meta-training in the job's log")
+    job("stop", "stopped")
+    logs = job("logs", "stopped")
+    assert "stopped; to go on: python -m services.meta_train --resume" in logs
+    iteration = Checkpoints(workplace / "runs" / "job" / "checkpoints", kept=1).newest().manifest.iteration
+    assert iteration >= int(progress.findall(logs)[-1])
+
+    fewer = ("--training.iterations", str(iteration + 2), "--training.checkpoint-every", "50000")
+    quick = ("--evaluation.shots", "1", "--evaluation.episodes", "1")
+    printed = submit("resumed", "meta_train", "--resume", str(workplace / "runs" / "job"), *fewer, *quick)
+    assert "succeeded" in printed
+    resumed = Checkpoints(workplace / "runs" / "job" / "checkpoints", kept=1).newest()
+    assert resumed.manifest.iteration == iteration + 2
+    whole = train("whole", *fewer)
+    np.testing.assert_array_equal(resumed.state.parameters, whole.state.parameters)
+
+
+@pytest.mark.slow
+def test_a_sweep_is_a_job_too(submit, workplace: Path):
+    small = {"scales": {"smoke": {"settings": {"training": {"iterations": 2, "checkpoint_every": 2}}}}}
+    sweep = {"what": "a test", "suites": ["ml10"], "seeds": [0], "variants": {"one": {}}, "shots": [1], **small}
+    (workplace / "small.yaml").write_text(json.dumps(sweep))
+    printed = submit("sweep", "tune_sweep", str(workplace / "small.yaml"), "--scale", "smoke", "--name", "small")
+    assert "1 finished" in printed
+    tables = json.loads((workplace / "runs" / "small" / "tables" / "tables.json").read_text())
+    assert tables["trials"] == {"finished": 1}
