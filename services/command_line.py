@@ -45,6 +45,7 @@ PROGRAMS = {
     "collect-demos": "let the scripted experts make demonstrations",
     "evaluate": "adapt a checkpoint to each task and measure its success rates",
     "tune-sweep": "run an ablation or a search on Ray Tune",
+    "doctor": "check a machine or a cluster before a long run",
     "report": "draw what there is to look at, and lay tables out",
 }
 

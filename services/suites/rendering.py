@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 
 from dmil_core.errors import UserError
 
-__all__ = ["RenderingError", "View", "picture"]
+__all__ = ["RenderingError", "View", "picture", "working_backend"]
 
 mujoco: Any = compiled_mujoco  # compiled, so a type checker sees nothing of it
 
@@ -105,3 +105,13 @@ def _drawing(model: Any, height: int, width: int) -> Iterator[Any]:
     finally:
         context.free()
         surface.free()
+
+
+def working_backend() -> str:
+    """Return the backend that draws here, after having drawn nothing with it.
+
+    Raises:
+        RenderingError: if there is none.
+    """
+    with _drawing(mujoco.MjModel.from_xml_string("<mujoco/>"), height=16, width=16):
+        return os.environ.get("MUJOCO_GL") or "egl"
