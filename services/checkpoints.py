@@ -22,7 +22,7 @@ from services.digests import checked_file, listing, sha256
 from services.disk import inside, read_file, room_for, sync
 from services.progress import console
 
-__all__ = ["Checkpoint", "CheckpointError", "Checkpoints", "Manifest"]
+__all__ = ["FILES", "SEAL", "Checkpoint", "CheckpointError", "Checkpoints", "Manifest"]
 
 MANIFEST, SEAL = "manifest.json", "manifest.sha256"
 PARAMETERS, OPTIMISER, CONSTANTS = "parameters.safetensors", "optimiser.safetensors", "constants.safetensors"
@@ -34,6 +34,13 @@ MOST_CONSTANTS = 2**26
 """Bytes of what a method learned once."""
 MOST_HEADER = 2**20
 """Bytes of a file of tensors besides the tensors."""
+FILES = {
+    PARAMETERS: MOST_TENSORS + MOST_HEADER,
+    OPTIMISER: 2 * MOST_TENSORS + MOST_HEADER,
+    CONSTANTS: MOST_CONSTANTS,
+    MANIFEST: MOST_MANIFEST,
+}
+"""What a checkpoint has besides its seal, and the most bytes of each."""
 
 Side = Annotated[int, Field(ge=1, le=MOST_TENSORS)]
 Shape = Annotated[tuple[Side, ...], Field(min_length=1, max_length=8)]

@@ -18,7 +18,7 @@ from rich.table import Table
 from dmil_core.configs import ExperimentConfig
 from services import inspect_demos, record_demos, verify_experts
 from services.command_line import DEFAULT_PRESET, defaults_from, exit_code, parse
-from services.demo_store import DemoStore, TaskDemonstrations, data_root
+from services.demo_store import TaskDemonstrations, open_store
 from services.experiment import Experiment, RunnerKind, open_runner
 from services.progress import Clock, console
 
@@ -53,7 +53,7 @@ def run(arguments: Sequence[str]) -> None:
         OTHERS[arguments[0]](arguments[1:])
         return
     given = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(arguments)))
-    store = DemoStore(data_root())
+    store = open_store()
     experiment = Experiment(given.experiment, store)
     clock = Clock()
     with open_runner(given.runner, experiment.suite, given.workers) as runner:

@@ -28,15 +28,18 @@ from dmil_core.demonstrations import Demonstration, DemonstrationError, digest
 from dmil_core.errors import explain
 from services.digests import check_listing, write_listing
 from services.disk import inside, read_file, room_for, sync
+from services.progress import console
+from services.storage import Storage, given_storage
 from services.suites.base import Attempt, TaskSuite
 
-__all__ = ["DemoStore", "TaskDemonstrations", "data_root"]
+__all__ = ["DemoStore", "TaskDemonstrations", "data_root", "open_store"]
 
 LIBRARIES = ("gymnasium", "gymnasium-robotics", "metaworld", "minari", "mujoco", "numpy")
 DIGESTS, ARRAYS, METADATA = "SHA256SUMS", "data/main_data.hdf5", "data/metadata.json"
 MOST_ARRAYS = 2**32
 """Bytes of a data set's file of arrays."""
 MOST_METADATA = 2**20
+FILES = {ARRAYS: MOST_ARRAYS, METADATA: MOST_METADATA}
 
 
 @dataclass(frozen=True)
@@ -65,9 +68,15 @@ def data_root() -> Path:
 class DemoStore:
     """The data sets under one data root."""
 
-    def __init__(self, root: Path) -> None:
-        """Use the data sets under `root`, which is made with the first of them."""
+    def __init__(self, root: Path, storage: Storage | None = None) -> None:
+        """Use the data sets under `root`, which is made with the first of them.
+
+        Args:
+            root: the folder.
+            storage: data sets that are not under the root are fetched from here, and new ones are copied to it.
+        """
         self.root = root.resolve()
+        self._storage = storage
 
     @staticmethod
     def dataset_id(task: str, suite: TaskSuite, config: DemonstrationConfig) -> str:
@@ -86,9 +95,9 @@ class DemoStore:
         """
         path = self.root / dataset_id
         try:
-            if not inside(self.root, dataset_id).exists():
+            if not inside(self.root, dataset_id).exists() and not self._fetched(dataset_id):
                 return None
-            check_listing(path, DIGESTS, {ARRAYS: MOST_ARRAYS, METADATA: MOST_METADATA})
+            check_listing(path, DIGESTS, FILES)
             metadata = _Metadata.model_validate_json(read_file(path / METADATA, MOST_METADATA))
             demonstrations = tuple(
                 Demonstration(f"{index:03d}", task, observations[:-1], actions)
@@ -158,7 +167,37 @@ class DemoStore:
                 return there
             finally:
                 shutil.rmtree(writing, ignore_errors=True)
+        self._copy(dataset_id)
         return TaskDemonstrations(dataset_id, demonstrations, failed, metadata["digest"])
+
+    def _fetched(self, dataset_id: str) -> bool:
+        """Fetch a data set from the storage, if it is there, and return whether it was."""
+        if self._storage is None:
+            return False
+        try:
+            return self._storage.get_sealed(f"data/{dataset_id}", self.root / dataset_id, FILES, DIGESTS)
+        except Exception as error:  # noqa: BLE001  whatever a storage raises, demonstrations can be made again
+            console.print(f"warning: {self._storage.url} gives no {dataset_id}: {error}", markup=False)
+            return False
+
+    def _copy(self, dataset_id: str) -> None:
+        """Copy a new data set to the storage."""
+        if self._storage is None:
+            return
+        contents = {file: (self.root / dataset_id / file).read_bytes() for file in (*FILES, DIGESTS)}
+        try:
+            self._storage.put_sealed(f"data/{dataset_id}", contents, DIGESTS)
+        except Exception as error:  # noqa: BLE001  whatever a storage raises, they are here
+            console.print(f"warning: {self._storage.url} does not take {dataset_id}: {error}", markup=False)
+
+
+def open_store() -> DemoStore:
+    """Return the store under the data root, with the storage that ``DMIL_STORAGE`` names behind it.
+
+    Raises:
+        StorageError: if it names none.
+    """
+    return DemoStore(data_root(), given_storage())
 
 
 def _write(folder: Path, successes: Sequence[Attempt], metadata: dict[str, Any]) -> None:

@@ -13,7 +13,7 @@ import tyro
 from dmil_core.configs import EvaluationConfig
 from services.checkpoints import Checkpoint, Checkpoints
 from services.command_line import exit_code, parse, peek, with_evaluation
-from services.demo_store import DemoStore, data_root
+from services.demo_store import open_store
 from services.experiment import Experiment, RunnerKind, open_runner
 from services.progress import Clock
 from services.report import show, write_report
@@ -51,7 +51,7 @@ def run(arguments: Sequence[str]) -> None:
     config = with_evaluation(checkpoint.manifest.config, given.evaluation)
     if given.tasks is not None:
         config = config.model_copy(update={"suite": config.suite.model_copy(update={"test_tasks": given.tasks})})
-    experiment = Experiment(config, DemoStore(data_root()))
+    experiment = Experiment(config, open_store())
     given.output.mkdir(parents=True, exist_ok=True)
     clock = Clock()
     with open_runner(given.runner, experiment.suite, given.workers) as runner:

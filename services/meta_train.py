@@ -3,6 +3,7 @@
 Every setting is a flag; what is not given comes from the YAML file of --config, and else from --preset.
 """
 
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,12 +19,14 @@ from dmil_core.configs import DEFAULT_METHOD, ExperimentConfig
 from dmil_core.errors import explain
 from services.checkpoints import Checkpoint, Checkpoints
 from services.command_line import DEFAULT_PRESET, ConfigError, defaults_from, exit_code, parse, peek
-from services.demo_store import DemoStore, data_root
+from services.demo_store import open_store
 from services.disk import read_file, write_file
 from services.experiment import Experiment, OnNonfinite, RunnerKind, open_runner
 from services.folders import find_folder, new_folder
 from services.progress import Clock, console
+from services.replica import replicated, restored
 from services.report import publish, show, write_report
+from services.storage import STORAGE
 from services.summary import summarise
 from services.tracking import Tracker, introduce
 
@@ -73,8 +76,13 @@ class Arguments:
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     given, folder, checkpoint = _read(arguments)
+    with replicated(folder, partial(console.print, markup=False)):
+        _carry_out(given, folder, checkpoint)
+
+
+def _carry_out(given: Arguments, folder: Path, checkpoint: Checkpoint | None) -> None:
     config = given.experiment
-    experiment = Experiment(config, DemoStore(data_root()))
+    experiment = Experiment(config, open_store())
     checkpoints = Checkpoints(folder / "checkpoints", config.training.checkpoints_kept)
     clock = Clock()
     folder.mkdir(parents=True, exist_ok=True)
@@ -129,7 +137,11 @@ def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]
             "--resume: got --preset, --config, --suite, --method or --demos with it; wanted none: a run goes on with "
             "its own settings"
         )
-    folder = find_folder(early.resume, early.runs or Arguments.runs, MARK)
+    runs = early.runs or Arguments.runs
+    wanted = Path(early.resume) if Path(early.resume).name != early.resume else runs / early.resume
+    if restored(wanted):
+        console.print(f"fetched from {os.environ[STORAGE]}: {wanted}", markup=False)
+    folder = find_folder(early.resume, runs, MARK)
     try:
         before = ExperimentConfig.model_validate_json(read_file(folder / MARK, MOST_BYTES))
     except (OSError, ValidationError) as error:

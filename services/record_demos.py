@@ -10,7 +10,7 @@ import tyro
 
 from dmil_core.demonstrations import Demonstration
 from services.command_line import ConfigError, exit_code, parse, suite_settings
-from services.demo_store import DemoStore, data_root
+from services.demo_store import open_store
 from services.progress import console
 from services.recordings import FORMS, demonstrations
 from services.suites.base import Attempt
@@ -41,7 +41,7 @@ def run(arguments: Sequence[str]) -> None:
         raise ConfigError(f"--from: got {given.source}; wanted npz:PATH, hdf5:PATH or minari:ID")
     suite = open_suite(suite_settings(given.suite, (given.task,)))
     recorded = demonstrations(given.task, given.source, suite, MOST)
-    store = DemoStore(data_root())
+    store = open_store()
     dataset_id = f"{suite.family}/{given.task}/recorded-{recorded.digest[:10]}-v2"
     saved = store.save(
         dataset_id,

@@ -15,7 +15,7 @@ from dmil_core.outer_loop import group_gradient, tasks_of
 from services.actors.simulation import SimulationWorker
 from services.checkpoints import Checkpoint
 from services.command_line import exit_code, parse
-from services.demo_store import DemoStore, data_root
+from services.demo_store import open_store
 from services.experiment import Experiment
 from services.failures import Failure, read_failure
 from services.progress import console
@@ -37,7 +37,7 @@ def run(arguments: Sequence[str]) -> None:
     given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
     failure = read_failure(given.failure)
     console.print(f"{failure.where}: it failed with\n{failure.problem}\nand is done again:")
-    experiment = Experiment(failure.config, DemoStore(data_root()))
+    experiment = Experiment(failure.config, open_store())
     work = _attempt if "attempt" in failure.piece else _slot if "slot" in failure.piece else _trial
     work(failure, experiment)()
     console.print("it comes to its end here: look for what differs, such as memory, versions or the machine")

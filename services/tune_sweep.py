@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from dmil_core.errors import RunError, explain
 from services.cluster import joined
 from services.command_line import ConfigError, exit_code, parse
-from services.demo_store import DemoStore, data_root
+from services.demo_store import open_store
 from services.experiment import Experiment
 from services.folders import find_folder, new_folder
 from services.progress import Clock, console
@@ -162,7 +162,7 @@ def _introduce(tracker: Tracker, sweep: SweepFolder) -> None:
 
 def _collect(sweep: SweepFolder) -> None:
     """Have all demonstrations there before the first trial, made on all CPUs."""
-    store = DemoStore(data_root())
+    store = open_store()
     configs = {(trial.config.suite, trial.config.demonstrations): trial.config for trial in sweep.trials.values()}
     for config in configs.values():
         experiment = Experiment(config, store)

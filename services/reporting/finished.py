@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import UserError, explain
 from services.checkpoints import Checkpoint, Checkpoints
-from services.demo_store import DemoStore, TaskDemonstrations, data_root
+from services.demo_store import TaskDemonstrations, open_store
 from services.disk import read_file
 from services.experiment import Experiment
 from services.folders import find_folder
@@ -98,7 +98,7 @@ class FinishedRun:
     @cached_property
     def experiment(self) -> Experiment:
         """Its suite and method, put together again."""
-        return Experiment(self.config, DemoStore(data_root()))
+        return Experiment(self.config, open_store())
 
     @cached_property
     def demonstrations(self) -> dict[str, TaskDemonstrations]:

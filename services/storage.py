@@ -1,0 +1,134 @@
+"""A place that all machines reach, named by a URL of fsspec, as ``s3://bucket/folder``.
+
+There a folder is whole or not at all, without a rename: the file that vouches for the others, its seal, comes last and
+goes first. So whoever was killed between two parts leaves nothing that anybody takes.
+"""
+
+import os
+import re
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+import fsspec
+
+from dmil_core.errors import RunError, UserError
+
+__all__ = ["STORAGE", "Storage", "StorageError", "TroubleError", "given_storage"]
+
+STORAGE = "DMIL_STORAGE"
+PACKAGES = {"s3": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs"}
+KINDS = "file:///folder, s3://bucket/folder, gs://bucket/folder"
+
+
+class StorageError(UserError):
+    """A URL that names no storage."""
+
+
+class TroubleError(RunError):
+    """A storage that cannot be reached, or does not give what it should."""
+
+
+class Storage:
+    """Folders and files under one URL, by names with slashes."""
+
+    def __init__(self, url: str) -> None:
+        """Name a storage; nothing is asked of it yet.
+
+        Raises:
+            StorageError: if the URL names none.
+        """
+        self.url = url
+        try:
+            self._files, root = fsspec.core.url_to_fs(url, use_listings_cache=False)
+        except ImportError as error:
+            package = PACKAGES.get(url.partition(":")[0], "the package that it names")
+            raise StorageError(f"{STORAGE}: got {url}, which needs {package}: pip install {package}") from error
+        except ValueError as error:
+            raise StorageError(f"{STORAGE}: got {url} ({error}); wanted a URL as {KINDS}") from error
+        self._root = root.rstrip("/")
+
+    def put(self, name: str, content: bytes) -> None:
+        """Write a file whole."""
+        path = self._path(name)
+        self._files.makedirs(path.rpartition("/")[0], exist_ok=True)
+        self._files.pipe_file(path, content)
+
+    def get(self, name: str, most: int) -> bytes | None:
+        """Return a file's content, or None if it is not there.
+
+        Raises:
+            TroubleError: for one of over `most` bytes.
+        """
+        try:
+            size = self._files.size(self._path(name))
+            if size > most:
+                raise TroubleError(f"{self.url}/{name}: got {size} bytes; wanted at most {most}; remove it")
+            return self._files.cat_file(self._path(name))
+        except FileNotFoundError:
+            return None
+
+    def put_sealed(self, name: str, contents: Mapping[str, bytes], seal: str) -> None:
+        """Write a folder's files, the seal last; a folder of that name which is there is none until then."""
+        self.remove(name, seal)
+        for file in sorted(contents, key=lambda file: file == seal):
+            self.put(f"{name}/{file}", contents[file])
+
+    def get_sealed(self, name: str, folder: Path, files: Mapping[str, int], seal: str) -> bool:
+        """Fetch a folder whose seal is there, and return whether it was; who reads it checks it.
+
+        Args:
+            name: of the folder here.
+            folder: where it goes; it is made by a rename, unless it is there by then.
+            files: what is in it besides the seal, and how many bytes each may have at most.
+            seal: the name of the file that vouches for them.
+
+        Raises:
+            TroubleError: for a file that is too large, or missing although the seal is there.
+        """
+        content = self.get(f"{name}/{seal}", 2**20)
+        if content is None:
+            return False
+        beside = folder.with_name(f".fetching-{os.getpid()}-{folder.name}")
+        try:
+            for file, most in files.items():
+                part = self.get(f"{name}/{file}", most)
+                if part is None:
+                    raise TroubleError(f"{self.url}/{name}/{file}: got nothing; wanted what its {seal} vouches for")
+                (beside / file).parent.mkdir(parents=True, exist_ok=True)
+                (beside / file).write_bytes(part)
+            (beside / seal).write_bytes(content)
+            if not folder.exists():
+                beside.replace(folder)
+        finally:
+            shutil.rmtree(beside, ignore_errors=True)
+        return True
+
+    def sealed(self, name: str, seal: str, pattern: str) -> dict[str, bytes]:
+        """Return the seals of the folders in a folder whose names match a pattern, by name, in order."""
+        try:
+            listed = self._files.ls(self._path(name), detail=False)
+        except FileNotFoundError:
+            return {}
+        names = sorted(path.rstrip("/").rpartition("/")[2] for path in listed)
+        seals = {own: self.get(f"{name}/{own}/{seal}", 2**20) for own in names if re.fullmatch(pattern, own)}
+        return {own: content for own, content in seals.items() if content is not None}
+
+    def remove(self, name: str, seal: str) -> None:
+        """Remove a folder, its seal first."""
+        for path in (f"{name}/{seal}", name):
+            if self._files.exists(self._path(path)):
+                self._files.rm(self._path(path), recursive=True)
+
+    def _path(self, name: str) -> str:
+        return f"{self._root}/{name}"
+
+
+def given_storage() -> Storage | None:
+    """Return the storage that ``DMIL_STORAGE`` names, if it does.
+
+    Raises:
+        StorageError: if it names none.
+    """
+    url = os.environ.get(STORAGE)
+    return Storage(url) if url else None
