@@ -135,7 +135,7 @@ def test_each_program_explains_itself(programs, name: str):
     code, printed = programs(name.replace("-", "_"), "--help")
     assert code == 0
     assert f"usage: python -m services.{name.replace('-', '_')} " in printed
-    assert {"tune-sweep": "--scale", "report": "tables"}.get(name, "--runner") in printed
+    assert {"tune-sweep": "--scale", "report": "tables", "doctor": "--runs"}.get(name, "--runner") in printed
 
 
 def test_the_console_script_lists_the_programs():
