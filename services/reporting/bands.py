@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from services.reporting.drawing import DASHES, Picture, colour_of, drawn, panels
 
@@ -85,24 +86,30 @@ def curves(title: str, rows: Mapping[str, Metrics], names: Mapping[str, str], *,
         return None
     columns = min(len(drawable), COLUMNS)
     lines = -(-len(drawable) // columns)
-    told = []
+    told: dict[str, list[str]] = {}
     with panels(lines, columns, width=max(5.3, 3.6 * columns), height=0.5 + 2.7 * lines) as (figure, axes):
         legend = {}
         for axis, (words, own) in zip(axes, drawable.items(), strict=False):
             for index, (row, curve) in enumerate(own.items()):
                 if curve is not None:
                     legend[row] = _draw(axis, index, curve)
-                    told.append(f"{words}, {row}: from {curve.mean[0]:.3g} to {curve.mean[-1]:.3g}")
+                    ends = f"from {curve.mean[0]:.3g} to {curve.mean[-1]:.3g}"
+                    told.setdefault(words, []).append(f"{row} {ends}")
             axis.set(title=words, xlabel="iteration")
+            axis.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+            low, high = (of([of(end) for curve in own.values() if curve for end in curve[2:]]) for of in (min, max))
             if rate:
                 axis.set_ylim(-0.02, 1.02)
-            else:
-                positive = all(curve.low.min() > 0 for curve in own.values() if curve is not None)
-                axis.set_yscale("log" if positive else "symlog", **({} if positive else {"linthresh": 0.01}))
+            elif 0 < 10 * low < high:
+                axis.set_yscale("log")
+                axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+                axis.yaxis.set_major_formatter("{x:g}")
+                axis.yaxis.set_minor_locator(NullLocator())
         for axis in axes[len(drawable) :]:
             axis.remove()
         figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=4, fontsize="small")
-        return drawn(figure, title, f"{'; '.join(told)}.")
+        ends = "; ".join(f"{words}: {', '.join(rows)}" for words, rows in told.items())
+        return drawn(figure, title, f"{ends}.")
 
 
 def _draw(axis: Axes, index: int, curve: Curve) -> Line2D:

@@ -53,9 +53,12 @@ def heat_map(
         metric: in words.
         digits: of the numbers.
     """
-    with panels(width=2.9 + 0.85 * len(rows), height=1.1 + 0.27 * len(tasks)) as (figure, axes):
+    wide = 1.4 + 0.07 * max(map(len, tasks)) + 0.85 * len(rows)
+    with panels(width=wide, height=1.1 + 0.27 * len(tasks)) as (figure, axes):
         axis = axes[0]
-        mesh = axis.pcolormesh(np.ma.masked_invalid(values), cmap=COLOURS, vmin=0, vmax=top, edgecolor="none")
+        mesh = axis.pcolormesh(
+            np.ma.masked_invalid(values), cmap=COLOURS, vmin=0, vmax=top, edgecolor="face", linewidth=0.5
+        )
         for (line, column), value in np.ndenumerate(values):
             if not np.isnan(value):
                 ink = ink_on(COLOURS(value / top))

@@ -1,5 +1,6 @@
 """Means of every row with their intervals, the paper's figures hollow beside them."""
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,10 +22,13 @@ APART = 0.17
 def means(comparison: Comparison) -> Picture:
     """Draw the means of every row, a panel for each suite and split."""
     metric, digits = comparison.metric.replace("_", " "), DIGITS[comparison.metric]
-    told = [f"{_where(of)} {of.shots}-shot: {of.row} {of.mean:.{digits}f}" for of in comparison.cells]
+    by_place: dict[str, list[str]] = defaultdict(list)
+    for of in comparison.cells:
+        by_place[f"{_where(of)}, {of.shots}-shot"].append(f"{of.row} {of.mean:.{digits}f}")
+    told = "; ".join(f"{place}: {', '.join(rows)}" for place, rows in by_place.items())
+    hollow = "Hollow marks are the paper's figures. " if any(of.paper for of in comparison.cells) else ""
     with _figure(comparison) as figure:
-        title = f"Mean {metric} of each row; bars are 95% intervals"
-        return drawn(figure, title, f"Hollow marks are the paper's figures. {'; '.join(told)}.")
+        return drawn(figure, f"Mean {metric} of each row; bars are 95% intervals", f"{hollow}{told}.")
 
 
 def draw_means(comparison: Comparison, path: Path, title: str) -> None:
@@ -52,6 +56,12 @@ def _figure(comparison: Comparison) -> Iterator[Figure]:
             axis.set_xlim(-0.02, 1.02 if comparison.metric == "success_rate" else None)
         for axis in axes[len(titles) :]:
             axis.remove()
+        labelled = {
+            label: mark
+            for axis in axes[: len(titles)]
+            for mark, label in zip(*axis.get_legend_handles_labels(), strict=True)
+        }
+        figure.legend(labelled.values(), labelled.keys(), loc="outside lower center", ncols=4, fontsize="small")
         yield figure
 
 
@@ -73,4 +83,3 @@ def _draw(axis: Axes, rows: Sequence[str], cells: Sequence[Cell]) -> None:
             )  # fmt: skip
     axis.set_yticks(range(len(rows)), rows)
     axis.set_ylim(len(rows) - 0.5, -0.5)
-    axis.legend(fontsize="small")

@@ -35,7 +35,7 @@ def profiles(where: str, rows: Sequence[str], by_shots: Mapping[int, Runs], metr
                 _draw(axis, rows.index(row), runs, top, middle, stream(0, "profile", where, str(shots), row))
                 told.append(f"{shots}-shot {middle} over {runs.size} runs")
             axis.set(title=f"{where}, {shots}-shot", xlabel=f"{metric} τ", ylabel="fraction of runs above τ")
-            axis.set(xlim=(0, top), ylim=(-0.02, 1.02))
+            axis.set(xlim=(-0.01 * top, 1.02 * top), ylim=(-0.02, 1.02))
             axis.legend(fontsize="small", title="interquartile mean", title_fontsize="small")
         title = f"Performance profile, {where}"
         return drawn(figure, title, f"Higher is better. Interquartile means: {'; '.join(told)}.")

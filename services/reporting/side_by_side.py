@@ -82,17 +82,15 @@ def _overview(comparison: Comparison) -> list[Part]:
     digits = DIGITS[comparison.metric]
     rows = []
     for of in comparison.cells:
-        interval = "" if of.low is None else f"{of.low:.{digits}f} to {of.high:.{digits}f}"
-        paper = "" if of.paper is None else of.paper.in_words(digits)
+        interval = "" if of.low is None else _together(f"{of.low:.{digits}f} to {of.high:.{digits}f}")
+        paper = "" if of.paper is None else _together(of.paper.in_words(digits))
         apart = "" if of.difference is None else f"{of.difference:+.{digits}f}{', outside' if of.outside else ''}"
         in_use = "" if of.sub_skills_in_use is None else f"{of.sub_skills_in_use:.1f}"
-        practised = f"{of.environment_steps:,}" if of.environment_steps else ""
         counts = [f"{len(of.seeds)}", f"{of.tasks}", f"{of.episodes}"]
-        figures = [f"{of.mean:.{digits}f}", interval, of.interval, f"{of.interquartile_mean:.{digits}f}"]
-        rows.append([*_place(of), *figures, *counts, paper, apart, in_use, practised])
-    head = ["row", "suite", "split", "shots", f"mean {_metric(comparison)}", "95% interval", "kind of interval"]
-    head += ["interquartile mean", "seeds", "tasks", "episodes", "paper", "difference from the paper"]
-    head += ["sub-skills in use", "environment steps"]
+        figures = [f"{of.mean:.{digits}f}", interval, f"{of.interquartile_mean:.{digits}f}"]
+        rows.append([*_place(comparison, of), *figures, *counts, paper, apart, in_use])
+    head = ["row", "suite", "split", "shots", f"mean {_metric(comparison)}", "95% interval", "interquartile mean"]
+    head += ["seeds", "tasks", "episodes", "paper", "from the paper", "sub-skills in use"]
     told = (
         "Over several seeds the interval is a stratified bootstrap's: seeds are drawn with replacement, then the "
         "episodes of each task; over one seed it is Wilson's, or Student's for scores, and says nothing of what "
@@ -103,8 +101,13 @@ def _overview(comparison: Comparison) -> list[Part]:
     return [means(comparison), _filled(f"{_metric(comparison).capitalize()}s", head, rows), Prose(told)]
 
 
-def _place(of: Cell | Difference) -> list[str]:
-    return [of.row, of.suite, of.split, f"{of.shots}"]
+def _together(figures: str) -> str:
+    """Return figures that stay on one line."""
+    return figures.replace(" ", "\u00a0")
+
+
+def _place(comparison: Comparison, of: Cell | Difference) -> list[str]:
+    return [of.row, of.suite if len(comparison.suites) > 1 else "", of.split, f"{of.shots}"]
 
 
 def _filled(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> DataTable:
@@ -122,14 +125,14 @@ def _differences(comparison: Comparison) -> list[Part]:
         if isinstance(of, Difference):
             interval = f"{of.low:+.{digits}f} to {of.high:+.{digits}f}"
             counts = f"{of.pairs}", f"{len(of.seeds)}"
-            rows.append([*_place(of), f"{of.mean:+.{digits}f}", interval, of.differs, *counts])
+            rows.append([*_place(comparison, of), f"{of.mean:+.{digits}f}", interval, of.differs, *counts])
     told = (
         f"Each row less {comparison.baseline}, on the same seeds and the same episodes, so that what both share falls "
-        "out; the interval is a stratified bootstrap's over seeds and episodes. Where it holds zero, nothing is "
-        "decided, which is not to say that there is no difference."
+        "out. The interval is a stratified bootstrap's over seeds and episodes, over one seed of its episodes. "
+        "Where it holds zero, nothing is decided, which is not to say that there is no difference."
     )
     head = ["row", "suite", "split", "shots", "difference", "95% interval", "differs?", "pairs", "seeds"]
-    parts = [Prose(told), DataTable(f"Differences from {comparison.baseline}", head, rows)] if rows else []
+    parts = [Prose(told), _filled(f"Differences from {comparison.baseline}", head, rows)] if rows else []
     return [*parts, *map(Prose, _unpaired(comparison))]
 
 
@@ -139,8 +142,10 @@ def _unpaired(comparison: Comparison) -> Iterator[str]:
         if isinstance(of, Unpaired):
             by_reason[of.row, of.why].append(of)
     for (row, why), found in by_reason.items():
-        where = "; ".join(f"{of.suite}, {of.split}, {of.shots}-shot" for of in found)
-        yield f"{row} is not paired with {comparison.baseline} ({where}): {why}."
+        everywhere = len(found) == sum(of.row == row for of in comparison.pairs)
+        places = "; ".join(f"{of.suite}, {of.split}, {of.shots}-shot" for of in found)
+        where = "" if everywhere else f" on {places}"
+        yield f"{row} is not paired with {comparison.baseline}{where}: {why}."
 
 
 def _benchmarks(comparison: Comparison) -> dict[str, Sequence[str]]:
@@ -268,7 +273,10 @@ def _settings(comparison: Comparison) -> list[Part]:
                 values.append(value)
     rows = list(dict.fromkeys(of.row for of in comparison.contenders))
     table = [[setting, *("; ".join(own.get(row, [])) for row in rows)] for setting, own in found.items()]
+    # A method's own settings stand together, wherever the first row that has them came.
+    sections = list(dict.fromkeys(setting.partition(".")[0] for setting in found))
     differing = [line for line in table if len(set(line[1:])) > 1]
+    differing.sort(key=lambda line: sections.index(line[0].partition(".")[0]))
     told = "All else is the same, but for the seed. An empty field is a setting that the method does not have."
     if not differing:
         return [Prose("None but the seed.")] if found else []
