@@ -1,4 +1,4 @@
-"""Lay the table of a sweep beside the paper's: on the terminal, in files of several forms, in MLflow."""
+"""Lay the table of a sweep beside the paper's: on the terminal, in files of several forms, as a page, in MLflow."""
 
 import csv
 import io
@@ -85,6 +85,7 @@ def show(tables: Tables, sweep: SweepFolder) -> None:
     for name, error in tables.failed.items():
         console.print(f"failed: {name}: {error}", markup=False)
     console.print(f"tables: {sweep.path / 'tables'}")
+    console.print(f"page: {sweep.path / 'tables' / 'report.html'}")
 
 
 def _samples_view(tables: Tables) -> Table:
