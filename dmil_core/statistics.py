@@ -13,6 +13,8 @@ __all__ = [
     "Rate",
     "interquartile_mean",
     "mean_score",
+    "performance_profile",
+    "profile_band",
     "share_entropy",
     "stratified_bootstrap",
     "success_rate",
@@ -114,3 +116,34 @@ def stratified_bootstrap(
 def interquartile_mean(values: Sequence[float]) -> float:
     """Return the mean of the middle half of `values` (Agarwal et al., NeurIPS 2021: of all runs on all tasks)."""
     return float(trim_mean(values, 0.25))
+
+
+def performance_profile(
+    runs: Float[np.ndarray, "*draws seeds tasks"], thresholds: Float[np.ndarray, " thresholds"]
+) -> Float[np.ndarray, "*draws thresholds"]:
+    """Return the fraction of runs, one a seed and task, above each threshold (Agarwal et al., NeurIPS 2021)."""
+    return (runs[..., None] > thresholds).mean((-3, -2))
+
+
+def profile_band(
+    runs: Float[np.ndarray, "seeds tasks"],
+    thresholds: Float[np.ndarray, " thresholds"],
+    draw: np.random.Generator,
+    confidence: float = 0.95,
+) -> tuple[Float[np.ndarray, " thresholds"], Float[np.ndarray, " thresholds"]]:
+    """Return the lower and upper end of a profile's percentile band, threshold by threshold.
+
+    Runs are drawn with replacement and every task keeps its weight. One training serves all tasks, so all runs of a
+    seed are drawn together; Agarwal et al. draw those of each task for themselves, as where each had its own training.
+
+    Args:
+        runs: the success rate, or mean score, of each seed on each task.
+        thresholds: of the profile.
+        draw: the stream of the resampling.
+        confidence: of the band.
+    """
+    again = runs[draw.integers(len(runs), size=(BOOTSTRAP_DRAWS, len(runs)))]
+    # Threshold by threshold: all at once would be draws x runs x thresholds numbers.
+    profiles = np.stack([performance_profile(again, thresholds[i : i + 1])[:, 0] for i in range(len(thresholds))], 1)
+    low, high = np.quantile(profiles, [(1 - confidence) / 2, (1 + confidence) / 2], axis=0)
+    return low, high

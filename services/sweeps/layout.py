@@ -1,32 +1,27 @@
-"""Lay the table of a sweep beside the paper's: on the terminal, in files of several forms, in MLflow."""
+"""Lay the table of a sweep beside the paper's: on the terminal, in files of several forms, as a page, in MLflow."""
 
 import csv
 import io
-from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib
-import numpy as np
 import tyro
 import yaml
+from rich.table import Table
 
 from services.command_line import parse
 from services.disk import write_file
 from services.folders import find_folder
 from services.progress import console
+from services.reporting.comparison import write_sweep_page
+from services.reporting.means import draw_means
+from services.sweeps.cells import DIGITS, Cell, Difference, Unpaired
 from services.sweeps.folders import MARK, SweepFolder
-from services.sweeps.tables import Cell, Difference, Sample, Tables, column_of, tables_of
+from services.sweeps.tables import Sample, Tables, column_of, comparison_of, tables_of
 from services.tracking import Tracker
 
-matplotlib.use("Agg")
-from matplotlib import pyplot  # after the choice of the backend
-from rich.table import Table
-
 __all__ = ["publish", "run", "show", "write_tables"]
-
-DIGITS = {"success_rate": 3, "score": 2}
 
 
 def _grid(tables: Tables) -> dict[str, dict[str, Cell]]:
@@ -85,9 +80,12 @@ def show(tables: Tables, sweep: SweepFolder) -> None:
         for found in tables.differences:
             view.add_row(*_difference_fields(found, digits))
         console.print(view)
+    for found in tables.unpaired:
+        console.print(_not_compared(found), markup=False)
     for name, error in tables.failed.items():
         console.print(f"failed: {name}: {error}", markup=False)
     console.print(f"tables: {sweep.path / 'tables'}")
+    console.print(f"page: {sweep.path / 'tables' / 'report.html'}")
 
 
 def _samples_view(tables: Tables) -> Table:
@@ -110,9 +108,15 @@ def _difference_fields(found: Difference, digits: int) -> list[str]:
     return [*fields, str(found.pairs), str(len(found.seeds)), found.differs]
 
 
+def _not_compared(found: Unpaired) -> str:
+    where = f"{found.suite}, {found.split}, {found.shots}-shot"
+    return f"Not compared: {found.row} with {found.baseline} ({where}): {found.why}"
+
+
 def write_tables(sweep: SweepFolder) -> Tables:
-    """Write the folder ``tables``: JSON, Markdown, CSV, LaTeX, a plot; of a search also the best settings."""
-    tables = tables_of(sweep)
+    """Write the folder ``tables``: JSON, Markdown, CSV, LaTeX, a plot, a page; of a search also the best settings."""
+    comparison = comparison_of(sweep)
+    tables = tables_of(sweep, comparison)
     folder = sweep.path / "tables"
     folder.mkdir(exist_ok=True)
     write_file(folder / "tables.json", tables.model_dump_json(indent=1) + "\n")
@@ -124,7 +128,8 @@ def write_tables(sweep: SweepFolder) -> Tables:
         best = yaml.safe_dump(tables.samples[0].settings, sort_keys=False)
         write_file(folder / "best.yaml", f"# {_head(tables)}; {tables.command}\n{best}")
     if tables.cells:
-        _draw(tables, folder / "table.png")
+        draw_means(comparison, folder / "table.png", _head(tables))
+    write_sweep_page(tables, comparison, folder / "report.html")
     return tables
 
 
@@ -167,6 +172,7 @@ def _markdown(tables: Tables) -> str:
         lines += ["", "On the same seeds and episodes:", ""]
         lines += _rows(["row", "against", "where", "difference", "95% interval", "pairs", "seeds", "differs?"])
         lines += [_row(_difference_fields(found, digits)) for found in tables.differences]
+    lines += [f"\n{_not_compared(found)}" for found in tables.unpaired]
     lines += [f"\nFailed: {name}: {' '.join(error.split())}" for name, error in tables.failed.items()]
     return "\n".join(lines) + "\n"
 
@@ -198,49 +204,6 @@ def _latex(tables: Tables) -> str:
         own = [stacked(_figures(grid[row].get(column), digits)) for column in tables.columns]
         lines.append(" & ".join([row.translate(_TEX), *own]) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
-
-
-def _panels(tables: Tables) -> Iterator[tuple[str, list[Cell]]]:
-    groups: dict[str, list[Cell]] = defaultdict(list)
-    for found in tables.cells:
-        groups[f"{found.suite}, {found.split}"].append(found)
-    yield from groups.items()
-
-
-def _draw(tables: Tables, path: Path) -> None:
-    """Draw each suite's and split's means with their intervals, the paper's hollow beside them."""
-    panels = list(_panels(tables))
-    columns = min(len(panels), 2)
-    lines = -(-len(panels) // columns)
-    top = (0, 1.03 if tables.metric == "success_rate" else None)
-    figure_, axes = pyplot.subplots(
-        lines, columns, figsize=(6.5 * columns, 3.6 * lines), layout="constrained", squeeze=False
-    )
-    for axis, (title, cells) in zip(axes.flat, panels, strict=False):
-        rows = list(dict.fromkeys(found.row for found in cells))
-        shots = sorted({found.shots for found in cells})
-        for index, count in enumerate(shots):
-            own = [found for found in cells if found.shots == count]
-            x = [rows.index(found.row) + 0.16 * (index - (len(shots) - 1) / 2) for found in own]
-            mean = np.array([found.mean for found in own])
-            below = [found.mean - (found.mean if found.low is None else found.low) for found in own]
-            above = [(found.mean if found.high is None else found.high) - found.mean for found in own]
-            axis.errorbar(x, mean, [below, above], fmt="o", capsize=3, color=f"C{index}", label=f"{count}-shot")
-            papers = [(place, found.paper) for place, found in zip(x, own, strict=True) if found.paper]
-            axis.errorbar(
-                [place + 0.06 for place, _ in papers], [paper.value for _, paper in papers],
-                [paper.spread or 0.0 for _, paper in papers], fmt="s", mfc="none", color=f"C{index}",
-                label=f"{count}-shot, paper" if papers else None,
-            )  # fmt: skip
-        axis.set(title=title, ylabel=tables.metric.replace("_", " "), xticks=range(len(rows)), ylim=top)
-        axis.set_xticklabels(rows, rotation=20 if len(rows) > 4 else 0)
-        axis.grid(axis="y", alpha=0.3)
-        axis.legend(fontsize="small")
-    for axis in axes.flat[len(panels) :]:
-        axis.remove()
-    figure_.suptitle(_head(tables), fontsize="medium")
-    figure_.savefig(path, dpi=110)
-    pyplot.close(figure_)
 
 
 def publish(tracker: Tracker, tables: Tables, sweep: SweepFolder) -> None:

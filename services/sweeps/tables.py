@@ -1,90 +1,18 @@
-"""The table of a sweep beside the paper's: means with intervals over seeds and episodes, and paired differences.
+"""The table of a sweep beside the paper's, of those of its trials that are finished by now."""
 
-A mean over several seeds has the interval of a stratified bootstrap over seeds, then episodes; over one seed Wilson's,
-or Student's for scores. The paper's figure is *outside* where it lies outside our interval and our mean outside its
-spread. Rows are compared on the same seeds and the same episodes.
-"""
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Literal
 
-import itertools
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
-from typing import Literal, NamedTuple
-
-import numpy as np
-from jaxtyping import Float
 from pydantic import BaseModel
 
-from dmil_core.seeding import stream
-from dmil_core.statistics import Interval, interquartile_mean, mean_score, stratified_bootstrap, success_rate
-from services.published import Published, figure
-from services.results import AdaptationResult, EpisodeResult, Split, read_rows
-from services.summary import sub_skill_use
-from services.sweeps.folders import SweepError, SweepFolder
+from services.command_line import with_evaluation
+from services.published import figure
+from services.sweeps.cells import Cell, Comparison, Contender, Difference, Place, Unpaired
+from services.sweeps.folders import SweepFolder
 from services.sweeps.settings import Metric
 
-__all__ = ["Cell", "Difference", "Place", "Sample", "Tables", "column_of", "outcomes_of", "tables_of"]
-
-Answer = Literal["yes, higher", "yes, lower", "not decided"]
-
-
-class Place(NamedTuple):
-    """What one cell is of."""
-
-    row: str
-    suite: str
-    split: Split
-    shots: int
-
-
-Outcomes = Mapping[int, Float[np.ndarray, "tasks episodes"]]
-"""Of each seed: the success or the score of each episode."""
-
-
-class Cell(BaseModel):
-    """One mean of the table."""
-
-    row: str
-    suite: str
-    split: Split
-    shots: int
-    seeds: list[int]
-    tasks: int
-    episodes: int
-    """Of all seeds and tasks."""
-    mean: float
-    low: float | None
-    high: float | None
-    interquartile_mean: float
-    """Over the rates of each task and seed."""
-    interval: Literal["bootstrap over seeds and episodes", "Wilson", "Student"]
-    sub_skills_in_use: float | None
-    """Those with over a tenth of a task's states after adaptation, on average over adaptations; none of a method
-    without sub-skills."""
-    environment_steps: int
-    """That meta-training took, of all seeds together."""
-    paper: Published | None
-    difference: float | None
-    """From the paper's figure."""
-    outside: bool | None
-    """Whether the two differ by more than either's spread; unknown where there is no interval."""
-
-
-class Difference(BaseModel):
-    """One row against another, episode by episode."""
-
-    row: str
-    baseline: str
-    suite: str
-    split: Split
-    shots: int
-    seeds: list[int]
-    pairs: int
-    """Of episodes."""
-    mean: float
-    low: float
-    high: float
-    differs: Answer
-    """Whether the interval leaves out zero."""
+__all__ = ["Sample", "Tables", "column_of", "comparison_of", "tables_of"]
 
 
 class Sample(BaseModel):
@@ -115,6 +43,8 @@ class Tables(BaseModel):
     columns: list[str]
     cells: list[Cell]
     differences: list[Difference]
+    unpaired: list[Unpaired]
+    """Rows that are not compared with the baseline though both were run."""
     samples: list[Sample]
     """Of a search, the best first."""
     trials: dict[str, int]
@@ -125,147 +55,55 @@ class Tables(BaseModel):
     """Of all finished trials, one after the other."""
 
 
-def outcomes_of(sweep: SweepFolder) -> dict[Place, Outcomes]:
-    """Return the outcome of each episode of all finished trials.
+def comparison_of(sweep: SweepFolder, baseline: str | None = None) -> Comparison:
+    """Return a sweep's rows as they are put side by side.
 
-    Raises:
-        SweepError: if a trial has not as many episodes of each task as the others.
+    Args:
+        sweep: whose trials they are of.
+        baseline: in place of the sweep's own.
     """
-    metric = sweep.record.sweep.metric
-    found: dict[Place, dict[int, np.ndarray]] = defaultdict(dict)
+    settings = sweep.record.sweep
+    named = baseline or settings.baseline or settings.row_names[0]
+    comparison = Comparison(
+        rows=settings.row_names,
+        suites=settings.suites,
+        splits=settings.splits,
+        shots=settings.shots,
+        metric=settings.metric,
+        by=settings.rows,
+        baseline=None if settings.search else named,
+        contenders=list(_contenders(sweep)),
+        published={},
+    )
+    if settings.paper is None:
+        return comparison
+    figures = {place: figure(settings.paper, *place) for place in comparison.places}
+    return replace(comparison, published={place: found for place, found in figures.items() if found is not None})
+
+
+def _contenders(sweep: SweepFolder) -> Iterator[Contender]:
     for name, trial in sweep.trials.items():
         result = sweep.result(name)
-        for row, folder in (result.evaluated if result else {}).items():
-            rows = read_rows(sweep.runs / folder / "episodes.jsonl", EpisodeResult)
-            for (split, shots), group in _grouped(rows).items():
-                by_task: dict[str, dict[int, float]] = defaultdict(dict)
-                for episode in group:
-                    by_task[episode.task][episode.episode] = float(
-                        episode.success if metric == "success_rate" else episode.score
-                    )
-                table = [[own[number] for number in sorted(own)] for _, own in sorted(by_task.items())]
-                if len({len(own) for own in table}) > 1:
-                    raise _other_episodes(sweep, row)
-                found[Place(row, trial.suite, split, shots)][trial.seed] = np.array(table)
-    for place, seeds in found.items():
-        if len({outcomes.shape for outcomes in seeds.values()}) > 1:
-            raise _other_episodes(sweep, place.row)
-    return dict(found)
+        if result is None:
+            continue
+        for row, folder in result.evaluated.items():
+            yield Contender(
+                row=row,
+                suite=trial.suite,
+                seed=trial.seed,
+                name=name,
+                config=with_evaluation(trial.config, trial.evaluations[row]),
+                environment_steps=result.environment_steps,
+                home=sweep.of_trial(name),
+                folder=sweep.runs / folder,
+            )
 
 
-def _other_episodes(sweep: SweepFolder, row: str) -> SweepError:
-    return SweepError(
-        f"{sweep.path}: got rows of {row} with not as many episodes of each task and seed; remove its folders named in "
-        "trials/*/result.json, and start the sweep again"
-    )
-
-
-def _in_use(sweep: SweepFolder) -> dict[Place, float | None]:
-    """Return how many sub-skills are in use per task in all finished trials."""
-    found: dict[Place, list[AdaptationResult]] = defaultdict(list)
-    for name, trial in sweep.trials.items():
-        result = sweep.result(name)
-        for row, folder in (result.evaluated if result else {}).items():
-            for adaptation in read_rows(sweep.runs / folder / "adaptations.jsonl", AdaptationResult):
-                found[Place(row, trial.suite, adaptation.split, adaptation.shots)].append(adaptation)
-    use = {place: sub_skill_use(rows).get(place.split) for place, rows in found.items()}
-    return {place: own and own.in_use_per_task for place, own in use.items()}
-
-
-def _environment_steps(sweep: SweepFolder) -> Counter[tuple[str, str]]:
-    """Return the environment steps of all finished trials, by row and suite."""
-    found: Counter[tuple[str, str]] = Counter()
-    for name, trial in sweep.trials.items():
-        result = sweep.result(name)
-        for row in result.evaluated if result else ():
-            found[row, trial.suite] += result.environment_steps if result else 0
-    return found
-
-
-def _grouped(rows: Iterable[EpisodeResult]) -> dict[tuple[Split, int], list[EpisodeResult]]:
-    groups: dict[tuple[Split, int], list[EpisodeResult]] = defaultdict(list)
-    for row in rows:
-        groups[row.split, row.shots].append(row)
-    return groups
-
-
-def cell(
-    place: Place,
-    outcomes: Outcomes,
-    in_use: float | None,
-    table: str | None,
-    metric: Metric,
-    environment_steps: int = 0,
-) -> Cell:
-    """Return the mean of some outcomes with its interval, and the paper's figure."""
-    seeds = sorted(outcomes)
-    values = np.stack([outcomes[seed] for seed in seeds])
-    low: float | None
-    high: float | None
-    if len(seeds) > 1:
-        mean, low, high = stratified_bootstrap(values, stream(0, "table", *map(str, place)))
-        kind = "bootstrap over seeds and episodes"
-    elif metric == "success_rate":
-        rate, kind = success_rate((values > 0).ravel().tolist()), "Wilson"
-        mean, low, high = rate.rate, rate.low, rate.high
-    else:
-        score, kind = mean_score(values.ravel().tolist()), "Student"
-        mean, low, high = score.mean, score.low, score.high
-    paper = None if table is None else figure(table, place.row, place.suite, place.split, place.shots)
-    outside = None
-    if paper is not None and low is not None and high is not None:
-        outside = not low <= paper.value <= high and abs(mean - paper.value) > (paper.spread or 0.0)
-    return Cell(
-        **place._asdict(),
-        seeds=seeds,
-        tasks=values.shape[1],
-        episodes=values.size,
-        mean=mean,
-        low=low,
-        high=high,
-        interquartile_mean=interquartile_mean(values.mean(2).ravel().tolist()),
-        interval=kind,
-        sub_skills_in_use=in_use,
-        environment_steps=environment_steps,
-        paper=paper,
-        difference=None if paper is None else mean - paper.value,
-        outside=outside,
-    )
-
-
-def difference(place: Place, baseline: str, outcomes: Outcomes, others: Outcomes) -> Difference | None:
-    """Return how one row differs from another on the seeds that both have, if there are any."""
-    seeds = sorted(outcomes.keys() & others.keys())
-    if not seeds or outcomes[seeds[0]].shape != others[seeds[0]].shape:
-        return None
-    values = np.stack([outcomes[seed] - others[seed] for seed in seeds])
-    found: Interval = stratified_bootstrap(values, stream(0, "difference", *map(str, place)))
-    differs: Answer = "yes, higher" if found.low > 0 else "yes, lower" if found.high < 0 else "not decided"
-    return Difference(
-        **place._asdict(), baseline=baseline, seeds=seeds, pairs=values.size, **found._asdict(), differs=differs
-    )
-
-
-def tables_of(sweep: SweepFolder) -> Tables:
-    """Work out what is shown of a sweep, of those of its trials that are finished by now."""
-    record = sweep.record
-    settings, outcomes = record.sweep, outcomes_of(sweep)
-    rows, baseline = settings.row_names, settings.baseline or settings.row_names[0]
-    places = [
-        Place(row, suite, split, shots)
-        for row in rows
-        for suite, split, shots in itertools.product(settings.suites, settings.splits, settings.shots)
-    ]
-    differences = [
-        difference(place, baseline, outcomes[place], outcomes[place._replace(row=baseline)])
-        for place in places
-        if place.row != baseline and place in outcomes and place._replace(row=baseline) in outcomes
-    ]
-    in_use, practised, results = (
-        _in_use(sweep),
-        _environment_steps(sweep),
-        {name: sweep.result(name) for name in sweep.trials},
-    )
+def tables_of(sweep: SweepFolder, comparison: Comparison | None = None) -> Tables:
+    """Work out what is shown of a sweep; `comparison` is what its rows are known to come to, if they are."""
+    record, comparison = sweep.record, comparison or comparison_of(sweep)
+    settings = record.sweep
+    results = {name: sweep.result(name) for name in sweep.trials}
     statuses = [result.status if result else "not run" for result in results.values()]
     return Tables(
         name=record.name,
@@ -277,21 +115,11 @@ def tables_of(sweep: SweepFolder) -> Tables:
         commit=record.commit,
         command=record.command,
         by=settings.rows,
-        rows=list(settings.suites) if settings.rows == "suites" else rows,
-        columns=list(dict.fromkeys(column_of(place, settings.rows) for place in places)),
-        cells=[
-            cell(
-                place,
-                outcomes[place],
-                in_use[place],
-                settings.paper,
-                settings.metric,
-                practised[place.row, place.suite],
-            )
-            for place in places
-            if place in outcomes
-        ],
-        differences=[found for found in differences if found is not None] if not settings.search else [],
+        rows=list(settings.suites if settings.rows == "suites" else settings.row_names),
+        columns=list(dict.fromkeys(column_of(place, settings.rows) for place in comparison.places)),
+        cells=comparison.cells,
+        differences=[pair for pair in comparison.pairs if isinstance(pair, Difference)],
+        unpaired=[pair for pair in comparison.pairs if isinstance(pair, Unpaired)],
         samples=_samples(sweep),
         trials={status: statuses.count(status) for status in dict.fromkeys(statuses)},
         failed={name: str(result.error) for name, result in results.items() if result and result.status == "failed"},

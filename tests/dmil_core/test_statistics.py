@@ -9,7 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmil_core.statistics import interquartile_mean, share_entropy, stratified_bootstrap, success_rate
+from dmil_core.statistics import (
+    interquartile_mean,
+    performance_profile,
+    profile_band,
+    share_entropy,
+    stratified_bootstrap,
+    success_rate,
+)
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=200), st.sampled_from([0.8, 0.95, 0.99]))
@@ -92,3 +99,32 @@ def test_bootstrap_covers_the_truth_about_as_often_as_it_says() -> None:
 def test_interquartile_mean_leaves_out_the_ends() -> None:
     assert interquartile_mean([100.0, 1.0, 2.0, -50.0]) == 1.5
     assert interquartile_mean([0.3]) == pytest.approx(0.3)
+
+
+def test_a_profile_is_the_fraction_of_runs_above_each_threshold() -> None:
+    runs = np.random.default_rng(0).integers(0, 5, (3, 7)) / 4
+    thresholds = np.array([-0.1, 0.0, 0.25, 0.3, 1.0])
+    wanted = [sum(rate > threshold for rate in runs.ravel()) / 21 for threshold in thresholds]
+    np.testing.assert_allclose(performance_profile(runs, thresholds), wanted)
+    assert wanted[0] == 1
+    assert wanted[-1] == 0, "above is not at"
+
+
+def test_a_profiles_band_is_that_of_all_draws_of_seeds() -> None:
+    """Against all 27 draws of three seeds; each extreme one has more than 2.5%, so the band reaches to it."""
+    runs = np.random.default_rng(1).integers(0, 21, (3, 6)) / 20
+    thresholds = np.linspace(0, 1, 11)
+    profiles = [
+        [np.mean(runs[list(seeds)] > threshold) for threshold in thresholds]
+        for seeds in itertools.product(range(3), repeat=3)
+    ]
+    low, high = profile_band(runs, thresholds, np.random.default_rng(2))
+    np.testing.assert_allclose(low, np.quantile(profiles, 0.025, axis=0, method="inverted_cdf"))
+    np.testing.assert_allclose(high, np.quantile(profiles, 0.975, axis=0, method="inverted_cdf"))
+    assert (low < high).any()
+
+
+def test_a_band_of_one_seed_has_no_width() -> None:
+    runs, thresholds = np.array([[0.0, 0.5, 1.0]]), np.array([0.0, 0.5])
+    for end in profile_band(runs, thresholds, np.random.default_rng(0)):
+        np.testing.assert_allclose(end, performance_profile(runs, thresholds))

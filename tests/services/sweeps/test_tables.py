@@ -1,10 +1,8 @@
-"""Tables of sweeps whose rows are made up, so that every figure in them is known."""
+"""Tables of sweeps whose rows are made up."""
 
 import csv
 import json
 import re
-from collections.abc import Callable, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -12,67 +10,11 @@ import pytest
 
 from dmil_core.settings import sub_skills_of
 from services import report
-from services.results import AdaptationResult, EpisodeResult, write_rows
-from services.sweeps.folders import SweepError, SweepFolder, SweepRecord, TrialResult
+from services.sweeps.cells import ComparisonError, Place
+from services.sweeps.folders import TrialResult
 from services.sweeps.layout import write_tables
-from services.sweeps.settings import Sweep
-from services.sweeps.tables import tables_of
-
-ROW = {
-    "suite": "ml10", "protocol": "p", "method": "dmil", "checkpoint": "c", "draw": 0, "support": ("d",), "data": "s",
-    "fine_tuning_steps": 1, "learning_rate": 0.1, "versions": {},
-}  # fmt: skip
-EPISODES = 20
-TASKS = ("reach", "push")
-
-Solved = Callable[[str, int, str, int, str, int], float]
-"""What an episode of variant, seed, split, shots, task and number comes to."""
-
-
-def make(runs: Path, solved: Solved, finished: Sequence[str] = (), **changes: object) -> SweepFolder:
-    """Write a sweep's folder with trials as if they had run; `finished` names their variants, all if there are none."""
-    settings = {
-        "what": "a test", "suites": ["ml10"], "seeds": [0, 1, 2], "variants": {"DMIL": {}, "DMIL-High": {}},
-        "paper": "table4", **changes,
-    }  # fmt: skip
-    record = SweepRecord(
-        name="made-up", size="smoke", sweep=Sweep.model_validate(settings), began=datetime(2026, 1, 2, tzinfo=UTC),
-        command="python -m services.tune_sweep made-up", commit="abc", versions={},
-    )  # fmt: skip
-    sweep = SweepFolder.make(runs / "made-up", record)
-    for number, (name, trial) in enumerate(sweep.trials.items()):
-        if finished and trial.variant not in finished:
-            continue
-        folder = runs / "trained" / str(number) / "evaluated" / "one"
-        folder.mkdir(parents=True)
-        episodes, adaptations = [], []
-        for split in ("meta-training", "meta-testing"):
-            for shots in (1, 3):
-                for task in TASKS:
-                    common = {**ROW, "split": split, "shots": shots, "task": task}
-                    for episode in range(EPISODES):
-                        value = solved(trial.variant, trial.seed, split, shots, task, episode)
-                        episodes.append(
-                            EpisodeResult.model_validate(
-                                {**common, "episode": episode, "seed": episode, "goal": (), "success": value > 0}
-                                | {"score": int(value), "steps": 3, "sub_skill_steps": (3,)}
-                            )
-                        )
-                    steps = (60, 40, 0) if shots == 1 else (97, 3, 0)
-                    use = {"steps": 100, "agreeing": 5, "sub_skill_steps": steps}
-                    adaptations.append(AdaptationResult.model_validate({**common, **use}))
-        write_rows(folder / "episodes.jsonl", episodes)
-        write_rows(folder / "adaptations.jsonl", adaptations)
-        (sweep.of_trial(name)).mkdir(parents=True)
-        paths = dict.fromkeys(trial.evaluations, str(folder.relative_to(runs)))
-        sweep.finish(name, TrialResult(status="finished", trained=str(number), evaluated=paths, seconds={"total": 2.0}))
-    return sweep
-
-
-def better(variant: str, seed: int, split: str, shots: int, task: str, episode: int) -> float:
-    """DMIL solves 15 to 17 of 20 by its seed; DMIL-High two fewer in meta-testing, as many in meta-training."""
-    lost = 2 if variant == "DMIL-High" and split == "meta-testing" else 0
-    return float(episode < 15 + seed - lost)
+from services.sweeps.tables import comparison_of, tables_of
+from tests.services.sweeps.made_up import EPISODES, TASKS, better, make
 
 
 def test_a_cell_has_mean_interval_counts_and_the_papers_figure(tmp_path: Path) -> None:
@@ -159,6 +101,20 @@ def test_what_was_not_run_is_empty_and_not_zero(tmp_path: Path) -> None:
     assert "3 seeds, 120 episodes" in text
 
 
+def test_rows_of_other_episodes_are_not_compared_and_the_table_says_so(tmp_path: Path) -> None:
+    sweep = make(tmp_path, better)
+    for name, trial in sweep.trials.items():
+        result = sweep.result(name)
+        if trial.variant == "DMIL-High" and result is not None:
+            file = tmp_path / result.evaluated["DMIL-High"] / "episodes.jsonl"
+            file.write_text(file.read_text().replace('"goal":[]', '"goal":[0.5]'))
+    tables = write_tables(sweep)
+    assert not tables.differences
+    assert {(found.row, found.baseline) for found in tables.unpaired} == {("DMIL-High", "DMIL")}
+    text = (sweep.path / "tables" / "table.md").read_text()
+    assert "Not compared: DMIL-High with DMIL (ml10, meta-testing, 3-shot): their episodes are others" in text
+
+
 def test_a_cell_says_how_many_seeds_it_has(tmp_path: Path) -> None:
     sweep = make(tmp_path, better)
     (sweep.of_trial("ml10-DMIL-seed-1") / "result.json").unlink()
@@ -171,7 +127,7 @@ def test_seeds_with_other_episodes_are_no_one_cell(tmp_path: Path) -> None:
     sweep = make(tmp_path, better)
     file = tmp_path / "trained" / "0" / "evaluated" / "one" / "episodes.jsonl"
     file.write_text("".join(file.read_text().splitlines(keepends=True)[1:]))
-    with pytest.raises(SweepError, match="got rows of DMIL with not as many episodes"):
+    with pytest.raises(ComparisonError, match="got rows of DMIL with not as many episodes"):
         tables_of(sweep)
 
 
@@ -189,6 +145,7 @@ def test_the_table_is_written_in_every_form(tmp_path: Path) -> None:
     assert len(differences) == 4
     assert json.loads((folder / "tables.json").read_text())["name"] == "made-up"
     assert (folder / "table.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "report.html").read_text().startswith("<!doctype html>")
     tex = (folder / "table.tex").read_text()
     assert tex.count(r"\begin{tabular}{lcccc}") == tex.count(r"\end{tabular}") == 1
     body = tex[tex.index(r"\midrule") :].splitlines()[1:3]
@@ -249,11 +206,9 @@ def test_report_tables_finds_a_sweep_by_name(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_outcomes_keep_their_order(tmp_path: Path) -> None:
-    from services.sweeps.tables import Place, outcomes_of
-
     sweep = make(tmp_path, lambda *of: float(of[4] == "push" and of[5] == of[1]))
-    outcomes = outcomes_of(sweep)[Place("DMIL", "ml10", "meta-testing", 3)]
-    for seed, values in outcomes.items():
+    outcomes = comparison_of(sweep).outcomes[Place("DMIL", "ml10", "meta-testing", 3)]
+    for seed, tried in outcomes.items():
         wanted = np.zeros((2, EPISODES))
         wanted[sorted(TASKS).index("push"), seed] = 1
-        np.testing.assert_array_equal(values, wanted)
+        np.testing.assert_array_equal(tried.outcomes, wanted)

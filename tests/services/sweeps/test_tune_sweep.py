@@ -86,8 +86,10 @@ def sweep(programs, workplace: Path, mlflow_file: str, joined) -> Callable[[str]
 @pytest.mark.slow
 @pytest.mark.alone
 @pytest.mark.parametrize("name", ROWS)
-def test_each_sweep_ends_with_its_table(sweep, name: str) -> None:
+def test_each_sweep_ends_with_its_table(sweep, mlflow_file: str, name: str) -> None:
     tables, parent, children = sweep(name)
+    artifacts = [found.path for found in MlflowClient(mlflow_file).list_artifacts(parent.info.run_id, "tables")]
+    assert {"tables/report.html", "tables/table.png"} <= set(artifacts)
     assert list(dict.fromkeys(cell["row"] for cell in tables["cells"])) == ROWS[name]
     assert all(cell["episodes"] and cell["seeds"] == [0] for cell in tables["cells"])
     papers = [cell["paper"] for cell in tables["cells"]]

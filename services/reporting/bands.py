@@ -1,0 +1,120 @@
+"""Curves of training: the mean over seeds, with a band."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+
+from services.reporting.drawing import DASHES, Picture, colour_of, drawn, panels
+
+__all__ = ["Curve", "Metrics", "curve_of", "curves"]
+
+Metrics = Sequence[Sequence[Mapping[str, float]]]
+"""Of each seed: the metrics of each iteration, under ``iteration`` its number."""
+COLUMNS = 3
+POINTS = 60
+"""A curve is drawn through so many means of neighbouring iterations at most."""
+
+
+class Curve(NamedTuple):
+    """One metric over the iterations."""
+
+    iterations: Float[np.ndarray, " points"]
+    mean: Float[np.ndarray, " points"]
+    """Over seeds."""
+    low: Float[np.ndarray, " points"]
+    """Of the lowest seed; of a single one, the lower end of its interval where the metric has one."""
+    high: Float[np.ndarray, " points"]
+
+
+def curve_of(metrics: Metrics, name: str) -> Curve | None:
+    """Return the curve of a metric over the iterations that all seeds with it have, if there are any.
+
+    A rate that the metrics name ``RATE/...`` has its interval under ``RATE_low/...`` and ``RATE_high/...``.
+    """
+    seeds = [rows for rows in metrics if any(name in row for row in rows)]
+    by_seed = [_by_iteration(rows, name) for rows in seeds]
+    steps = sorted(set.intersection(*map(set, by_seed))) if by_seed else []
+    if not steps:
+        return None
+    values = _in_means(np.array([[own[step] for step in steps] for own in by_seed]))
+    low, high = values.min(0), values.max(0)
+    rate, _, rest = name.partition("/")
+    if len(seeds) == 1 and any(f"{rate}_low/{rest}" in row for row in seeds[0]):
+        both = [_by_iteration(seeds[0], f"{rate}_{end}/{rest}") for end in ("low", "high")]
+        low, high = _in_means(np.array([[own[step] for step in steps] for own in both]))
+    size = _size(len(steps))
+    ends = [steps[first : first + size][-1] for first in range(0, len(steps), size)]
+    return Curve(np.array(ends, float), values.mean(0), low, high)
+
+
+def _by_iteration(rows: Sequence[Mapping[str, float]], name: str) -> dict[int, float]:
+    return {int(row["iteration"]): row[name] for row in rows if name in row}
+
+
+def _size(count: int) -> int:
+    return -(-count // POINTS)
+
+
+def _in_means(values: Float[np.ndarray, "seeds iterations"]) -> Float[np.ndarray, "seeds points"]:
+    """Return means of neighbouring iterations, of as many each as leave no more than `POINTS`."""
+    size = _size(values.shape[1])
+    return np.stack([values[:, first : first + size].mean(1) for first in range(0, values.shape[1], size)], 1)
+
+
+def curves(title: str, rows: Mapping[str, Metrics], names: Mapping[str, str], *, rate: bool = False) -> Picture | None:
+    """Draw a panel for each metric that some row has, with a line for each of these rows.
+
+    Args:
+        title: of the picture.
+        rows: the metrics of each, in the order of their colours.
+        names: of the metrics, by the words above their panels.
+        rate: from 0 to 1.
+
+    Returns:
+        Nothing, if no row has more than one point of any.
+    """
+    found = {words: {row: curve_of(metrics, name) for row, metrics in rows.items()} for words, name in names.items()}
+    drawable = {
+        words: own for words, own in found.items() if any(curve and len(curve.mean) > 1 for curve in own.values())
+    }
+    if not drawable:
+        return None
+    columns = min(len(drawable), COLUMNS)
+    lines = -(-len(drawable) // columns)
+    told: dict[str, list[str]] = {}
+    with panels(lines, columns, width=max(5.3, 3.6 * columns), height=0.5 + 2.7 * lines) as (figure, axes):
+        legend = {}
+        for axis, (words, own) in zip(axes, drawable.items(), strict=False):
+            for index, (row, curve) in enumerate(own.items()):
+                if curve is not None:
+                    legend[row] = _draw(axis, index, curve)
+                    ends = f"from {curve.mean[0]:.3g} to {curve.mean[-1]:.3g}"
+                    told.setdefault(words, []).append(f"{row} {ends}")
+            axis.set(title=words, xlabel="iteration")
+            axis.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+            low, high = (of([of(end) for curve in own.values() if curve for end in curve[2:]]) for of in (min, max))
+            if rate:
+                axis.set_ylim(-0.02, 1.02)
+            elif 0 < 10 * low < high:
+                axis.set_yscale("log")
+                axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+                axis.yaxis.set_major_formatter("{x:g}")
+                axis.yaxis.set_minor_locator(NullLocator())
+        for axis in axes[len(drawable) :]:
+            axis.remove()
+        figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=4, fontsize="small")
+        ends = "; ".join(f"{words}: {', '.join(rows)}" for words, rows in told.items())
+        return drawn(figure, title, f"{ends}.")
+
+
+def _draw(axis: Axes, index: int, curve: Curve) -> Line2D:
+    colour, dashes = colour_of(index), DASHES[index % len(DASHES)]
+    marker = "o" if len(curve.mean) < 20 else None
+    (line,) = axis.plot(curve.iterations, curve.mean, color=colour, linestyle=dashes, marker=marker, markersize=3)
+    axis.fill_between(curve.iterations, curve.low, curve.high, color=colour, alpha=0.15, linewidth=0)
+    return line

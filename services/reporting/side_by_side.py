@@ -1,0 +1,306 @@
+"""The page that puts rows side by side: of a few runs, or of a sweep."""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from services.digests import sha256
+from services.reporting.bands import curves
+from services.reporting.drawing import Picture
+from services.reporting.heat_map import heat_map
+from services.reporting.means import means
+from services.reporting.page import Commands, DataTable, Part, Prose, Section, write_page
+from services.reporting.profiles import Runs, profiles
+from services.results import Split
+from services.sweeps.cells import DIGITS, Cell, Comparison, Contender, Difference, Place, Unpaired
+
+__all__ = ["write_comparison"]
+
+
+def write_comparison(
+    path: Path, title: str, lead: Sequence[str], comparison: Comparison, commands: Sequence[Commands]
+) -> None:
+    """Write the page.
+
+    Args:
+        path: of the file.
+        title: of the page.
+        lead: paragraphs at its top.
+        comparison: what is put side by side.
+        commands: how all of it is had again.
+
+    Raises:
+        ComparisonError: if a row has not as many episodes of each task and seed.
+        DiskFullError: for want of space.
+    """
+    sections = [
+        Section(f"{_metric(comparison).capitalize()}s", _overview(comparison)),
+        Section("Paired differences", _differences(comparison)),
+        Section("Performance profiles", _profiles(comparison)),
+        Section("Each task", _heat_maps(comparison)),
+        Section("Training curves", _curves(comparison)),
+        Section("Settings that differ", _settings(comparison)),
+        Section("Runs and commands", [*_runs(comparison), *commands]),
+    ]
+    write_page(path, title, [Prose(text) for text in (*lead, *_warnings(comparison))], sections)
+
+
+def _metric(comparison: Comparison) -> str:
+    return comparison.metric.replace("_", " ")
+
+
+def _warnings(comparison: Comparison) -> Iterator[str]:
+    """Say what keeps rows from being a contest."""
+    for suite in comparison.suites:
+        tried = {
+            place: next(iter(seeds.values())) for place, seeds in comparison.outcomes.items() if place.suite == suite
+        }
+        protocols = _rows_by({place.row: own.protocol for place, own in tried.items()})
+        if len(protocols) > 1:
+            told = "; ".join(f"{', '.join(rows)}: {protocol}" for protocol, rows in protocols.items())
+            yield f"The protocols of {suite} differ, so the figures are of different things: {told}."
+        for split in comparison.splits:
+            tasks = _rows_by({place.row: own.tasks for place, own in tried.items() if place.split == split})
+            if len(tasks) > 1:
+                told = "; ".join(f"{', '.join(rows)}: {', '.join(names)}" for names, rows in tasks.items())
+                yield f"The {split} tasks of {suite} differ, so the means are over different tasks: {told}."
+
+
+def _rows_by(values: Mapping[str, Any]) -> dict[Any, list[str]]:
+    rows: dict[Any, list[str]] = defaultdict(list)
+    for row, value in values.items():
+        rows[value].append(row)
+    return rows
+
+
+def _overview(comparison: Comparison) -> list[Part]:
+    if not comparison.cells:
+        return [Prose("Nothing is finished yet.")]
+    digits = DIGITS[comparison.metric]
+    rows = []
+    for of in comparison.cells:
+        interval = "" if of.low is None else _together(f"{of.low:.{digits}f} to {of.high:.{digits}f}")
+        paper = "" if of.paper is None else _together(of.paper.in_words(digits))
+        apart = "" if of.difference is None else f"{of.difference:+.{digits}f}{', outside' if of.outside else ''}"
+        in_use = "" if of.sub_skills_in_use is None else f"{of.sub_skills_in_use:.1f}"
+        counts = [f"{len(of.seeds)}", f"{of.tasks}", f"{of.episodes}"]
+        figures = [f"{of.mean:.{digits}f}", interval, f"{of.interquartile_mean:.{digits}f}"]
+        rows.append([*_place(comparison, of), *figures, *counts, paper, apart, in_use])
+    head = ["row", "suite", "split", "shots", f"mean {_metric(comparison)}", "95% interval", "interquartile mean"]
+    head += ["seeds", "tasks", "episodes", "paper", "from the paper", "sub-skills in use"]
+    told = (
+        "Over several seeds the interval is a stratified bootstrap's: seeds are drawn with replacement, then the "
+        "episodes of each task; over one seed it is Wilson's, or Student's for scores, and says nothing of what "
+        "another seed would do. The interquartile mean is over tasks and seeds. Outside: the paper's figure lies "
+        "outside our interval, and our mean outside its spread. In use is a sub-skill with over a tenth of a task's "
+        "states after adaptation."
+    )
+    return [means(comparison), _filled(f"{_metric(comparison).capitalize()}s", head, rows), Prose(told)]
+
+
+def _together(figures: str) -> str:
+    """Return figures that stay on one line."""
+    return figures.replace(" ", "\u00a0")
+
+
+def _place(comparison: Comparison, of: Cell | Difference) -> list[str]:
+    return [of.row, of.suite if len(comparison.suites) > 1 else "", of.split, f"{of.shots}"]
+
+
+def _filled(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> DataTable:
+    """Return a table without the columns that no row has anything in."""
+    kept = [index for index in range(len(head)) if any(row[index] for row in rows)]
+    return DataTable(caption, [head[index] for index in kept], [[row[index] for index in kept] for row in rows])
+
+
+def _differences(comparison: Comparison) -> list[Part]:
+    if comparison.baseline is None or not comparison.pairs:
+        return []
+    digits = DIGITS[comparison.metric]
+    rows = []
+    for of in comparison.pairs:
+        if isinstance(of, Difference):
+            interval = f"{of.low:+.{digits}f} to {of.high:+.{digits}f}"
+            counts = f"{of.pairs}", f"{len(of.seeds)}"
+            rows.append([*_place(comparison, of), f"{of.mean:+.{digits}f}", interval, of.differs, *counts])
+    told = (
+        f"Each row less {comparison.baseline}, on the same seeds and the same episodes, so that what both share falls "
+        "out. The interval is a stratified bootstrap's over seeds and episodes, over one seed of its episodes. "
+        "Where it holds zero, nothing is decided, which is not to say that there is no difference."
+    )
+    head = ["row", "suite", "split", "shots", "difference", "95% interval", "differs?", "pairs", "seeds"]
+    parts = [Prose(told), _filled(f"Differences from {comparison.baseline}", head, rows)] if rows else []
+    return [*parts, *map(Prose, _unpaired(comparison))]
+
+
+def _unpaired(comparison: Comparison) -> Iterator[str]:
+    by_reason: dict[tuple[str, str], list[Unpaired]] = defaultdict(list)
+    for of in comparison.pairs:
+        if isinstance(of, Unpaired):
+            by_reason[of.row, of.why].append(of)
+    for (row, why), found in by_reason.items():
+        everywhere = len(found) == sum(of.row == row for of in comparison.pairs)
+        places = "; ".join(f"{of.suite}, {of.split}, {of.shots}-shot" for of in found)
+        where = "" if everywhere else f" on {places}"
+        yield f"{row} is not paired with {comparison.baseline}{where}: {why}."
+
+
+def _benchmarks(comparison: Comparison) -> dict[str, Sequence[str]]:
+    """Return the suites whose tasks are looked at together, by what they are called."""
+    if comparison.by == "suites" and len(comparison.suites) > 1:
+        return {f"{len(comparison.suites)} suites": comparison.suites}
+    return {suite: [suite] for suite in comparison.suites}
+
+
+def _profiles(comparison: Comparison) -> list[Part]:
+    pictures: list[Part] = []
+    for called, suites in _benchmarks(comparison).items():
+        for split in comparison.splits:
+            found = {shots: _runs_of(comparison, suites, split, shots) for shots in comparison.shots}
+            by_shots = {shots: own for shots, own in found.items() if any(runs.size > 1 for runs in own.values())}
+            if by_shots:
+                metric, digits = _metric(comparison), DIGITS[comparison.metric]
+                pictures.append(profiles(f"{called}, {split}", comparison.rows, by_shots, metric, digits))
+    several = any(len(of.seeds) > 1 for of in comparison.cells)
+    band = (
+        "The band is a stratified bootstrap's, 95%, threshold by threshold: seeds are drawn with replacement, all runs "
+        "of a seed together, for one training serves all tasks."
+        if several
+        else "There is one seed of each row, which says nothing of another: so there are no bands."
+    )
+    told = (
+        f"A run is one seed on one task. The curve is the fraction of runs whose {_metric(comparison)} is above τ: the "
+        f"higher the better, and a row whose curve is nowhere below another's is better throughout. {band} (Agarwal et "
+        "al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS 2021.)"
+    )
+    return [Prose(told), *pictures] if pictures else []
+
+
+def _runs_of(comparison: Comparison, suites: Sequence[str], split: Split, shots: int) -> Runs:
+    """Return what each row came to that was run on all of some suites: of each seed on each task."""
+    found = {}
+    for row in comparison.rows:
+        own = [comparison.outcomes.get(Place(row, suite, split, shots), {}) for suite in suites]
+        if seeds := sorted(set.intersection(*map(set, own))):
+            rates = [np.concatenate([seen[seed].outcomes.mean(1) for seen in own]) for seed in seeds]
+            found[row] = np.stack(rates)
+    return found
+
+
+def _heat_maps(comparison: Comparison) -> list[Part]:
+    pictures: list[Part] = []
+    outcomes = [tried.outcomes for seeds in comparison.outcomes.values() for tried in seeds.values()]
+    top = max(1.0, *(float(values.max()) for values in outcomes)) if outcomes else 1.0
+    for called, suites in _benchmarks(comparison).items():
+        for split in comparison.splits:
+            by_shots = {shots: _by_task(comparison, suites, split, shots) for shots in comparison.shots}
+            order = _from_the_easiest([own for by_row in by_shots.values() for own in by_row.values()])
+            for shots, by_row in by_shots.items():
+                if by_row:
+                    values = [[own.get(task, np.nan) for own in by_row.values()] for task in order]
+                    title = f"{_metric(comparison).capitalize()} on each task: {called}, {split}, {shots}-shot"
+                    names = [task if len(suites) == 1 else f"{suite}: {task}" for suite, task in order]
+                    pictures.append(
+                        heat_map(
+                            title, list(by_row), names, np.array(values), top=top, metric=f"mean {_metric(comparison)}"
+                        )
+                    )
+    told = "The mean over seeds and episodes. Tasks stand in one order for all shots, from that which most rows solve."
+    return [Prose(told), *pictures] if pictures else []
+
+
+Task = tuple[str, str]
+"""Suite and name."""
+
+
+def _by_task(comparison: Comparison, suites: Sequence[str], split: Split, shots: int) -> dict[str, dict[Task, float]]:
+    """Return the mean of each row on each task, of the rows that have any."""
+    found: dict[str, dict[Task, float]] = {}
+    for row in comparison.rows:
+        for suite in suites:
+            if seeds := comparison.outcomes.get(Place(row, suite, split, shots)):
+                own = np.mean([tried.outcomes.mean(1) for tried in seeds.values()], 0)
+                tasks = next(iter(seeds.values())).tasks
+                found.setdefault(row, {}).update(zip([(suite, task) for task in tasks], own.tolist(), strict=True))
+    return found
+
+
+def _from_the_easiest(means: Sequence[Mapping[Task, float]]) -> list[Task]:
+    tasks = sorted({task for own in means for task in own})
+    return sorted(tasks, key=lambda task: -float(np.mean([own[task] for own in means if task in own])))
+
+
+def _curves(comparison: Comparison) -> list[Part]:
+    pictures: list[Picture | None] = []
+    for suite in comparison.suites:
+        rows = _trained(comparison, suite)
+        metrics = {", ".join(names): [of.metrics for of in own] for names, own in rows.items()}
+        places = [(split, shots) for split in comparison.splits for shots in comparison.shots]
+        rates = {f"{split}, {shots}-shot": f"{comparison.metric}/{split}/{shots}-shot" for split, shots in places}
+        title = f"{_metric(comparison).capitalize()} over training, {suite}"
+        pictures.append(curves(title, metrics, rates, rate=comparison.metric == "success_rate"))
+        names = dict.fromkeys(name for own in metrics.values() for rows_ in own for row in rows_ for name in row)
+        losses = {name.replace("_", " "): name for name in names if "loss" in name}
+        pictures.append(curves(f"Losses over training, {suite}", metrics, losses))
+    told = (
+        "The line is the mean over a row's seeds, in means of neighbouring iterations, and the band reaches from the "
+        "lowest seed to the highest. Over one seed a success rate's band is its 95% interval over episodes, and a loss "
+        "has none. Losses of different methods are different things: compare their course, not their height."
+    )
+    drawn = [picture for picture in pictures if picture is not None]
+    return [Prose(told), *drawn] if drawn else []
+
+
+def _trained(comparison: Comparison, suite: str) -> dict[tuple[str, ...], list[Contender]]:
+    """Return the contenders on a suite by their rows; rows that differ only in how they are evaluated are one here."""
+    homes: dict[str, dict[Path, Contender]] = {}
+    for of in comparison.contenders:
+        if of.suite == suite:
+            homes.setdefault(of.row, {})[of.home] = of
+    rows = _rows_by({row: tuple(own) for row, own in homes.items()})
+    return {tuple(names): list(homes[names[0]].values()) for names in rows.values()}
+
+
+def _settings(comparison: Comparison) -> list[Part]:
+    found: dict[str, dict[str, list[str]]] = {}
+    for of in comparison.contenders:
+        for setting, value in _flat(of).items():
+            values = found.setdefault(setting, {}).setdefault(of.row, [])
+            if value not in values:
+                values.append(value)
+    rows = list(dict.fromkeys(of.row for of in comparison.contenders))
+    table = [[setting, *("; ".join(own.get(row, [])) for row in rows)] for setting, own in found.items()]
+    # A method's own settings stand together, wherever the first row that has them came.
+    sections = list(dict.fromkeys(setting.partition(".")[0] for setting in found))
+    differing = [line for line in table if len(set(line[1:])) > 1]
+    differing.sort(key=lambda line: sections.index(line[0].partition(".")[0]))
+    told = "All else is the same, but for the seed. An empty field is a setting that the method does not have."
+    if not differing:
+        return [Prose("None but the seed.")] if found else []
+    return [DataTable("Settings that differ", ["setting", *rows], differing), Prose(told)]
+
+
+def _flat(of: Contender) -> dict[str, str]:
+    """Return all settings of a contender but the seed, with what else decides its figures."""
+    found: dict[str, str] = {}
+    for section, settings in of.config.model_dump(mode="json", exclude={"seed"}).items():
+        for name, value in settings.items():
+            found[f"{section}.{name}"] = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    data = {f"{row.task} {row.data}" for row in of.episodes}
+    versions = of.episodes[0].versions if of.episodes else {}
+    found["data sets' SHA-256"] = sha256("\n".join(sorted(data)).encode())[:12]
+    return found | {f"version of {name}": version for name, version in versions.items()}
+
+
+def _runs(comparison: Comparison) -> list[Part]:
+    rows = []
+    for of in comparison.contenders:
+        practised = f"{of.environment_steps:,}" if of.environment_steps else ""
+        checkpoint = of.episodes[0].checkpoint[:12] if of.episodes else ""
+        which = [of.name, of.row, of.suite, f"{of.seed}", of.config.method.name]
+        rows.append([*which, f"{of.config.training.iterations}", practised, checkpoint])
+    head = ["run", "row", "suite", "seed", "method", "iterations", "environment steps", "checkpoint"]
+    return [_filled("Runs", head, rows)] if rows else []
