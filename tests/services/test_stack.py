@@ -3,6 +3,7 @@
 They run in a network of their own, whose only addresses are loopback's: there each node has one, as on a cluster.
 """
 
+import json
 import os
 import secrets
 import shutil
@@ -26,7 +27,10 @@ class Network:
 
     def __init__(self, folder: Path, environment: dict[str, str]) -> None:
         self._folder, self._environment = folder, environment
-        self._holder = subprocess.Popen(["unshare", "--net", "sleep", "infinity"])
+        up = "ip link set lo up && echo up && exec sleep infinity"
+        self._holder = subprocess.Popen(["unshare", "--net", "sh", "-c", up], stdout=subprocess.PIPE)
+        assert self._holder.stdout
+        assert self._holder.stdout.readline() == b"up\n"
         self._inside = ["nsenter", "--target", str(self._holder.pid), "--net"]
         self._processes: list[subprocess.Popen[Any]] = []
 
@@ -54,6 +58,8 @@ class Network:
             process.wait(30)
         self._holder.kill()
         self._holder.wait()
+        if self._holder.stdout:
+            self._holder.stdout.close()
 
 
 @pytest.fixture
@@ -99,9 +105,9 @@ def postgres(network: Network, wait_for: Callable[..., None]) -> Iterator[str]:
     server = [str(POSTGRES / "postgres"), "-D", str(folder / "data"), "-k", str(folder), "-h", "127.0.0.1"]
     user = ["setpriv", "--reuid=postgres", "--regid=postgres", "--clear-groups"] if as_postgres else []
     network.start("postgres", *user, *server)
-    ready = (str(POSTGRES / "pg_isready"), "-h", "127.0.0.1")
+    ready = (str(POSTGRES / "pg_isready"), "-h", "127.0.0.1", "-U", "mlflow")
     wait_for(lambda: network.run(*ready).returncode == 0, "Postgres", SECONDS)
-    yield "postgresql://mlflow@127.0.0.1/postgres"
+    yield "postgresql+psycopg2://mlflow@127.0.0.1/postgres"
     network.close()
     shutil.rmtree(folder)
 
@@ -132,8 +138,8 @@ def test_a_job_on_two_raylets_becomes_a_finished_run_of_mlflow_on_postgres(
                 f"worker{number}", *ray, "start", "--address=127.0.0.1:6379", f"--node-ip-address={address}",
                 "--num-cpus=1", *common,
             )  # fmt: skip
-        nodes = (*ray, "list", "nodes", "--address", "http://127.0.0.1:8265", "--format", "json")
-        wait_for(lambda: network.run(*nodes).stdout.count("ALIVE") == 3, "Ray's workers", SECONDS)
+        status = (*ray, "status", "--address", "127.0.0.1:6379")
+        wait_for(lambda: network.run(*status).stdout.count(" 1 node_") == 3, "Ray's workers", SECONDS)
         server_answers = (sys.executable, "-c", client + "c.search_experiments()")
         wait_for(lambda: network.run(*server_answers).returncode == 0, "MLflow", SECONDS)
         submitted = network.run(
@@ -145,9 +151,12 @@ def test_a_job_on_two_raylets_becomes_a_finished_run_of_mlflow_on_postgres(
         assert submitted.returncode == 0, submitted.stdout + submitted.stderr
         look = "r = c.search_runs([c.get_experiment_by_name('dmil-ml10').experiment_id]); print([x.info.status for x in r])"
         assert network.run(sys.executable, "-c", client + look).stdout.strip() == "['FINISHED']"
-        actors = network.run(*ray, "list", "actors", "--address", "http://127.0.0.1:8265", "--format", "json", "--detail")
-        homes = {line.split('"')[3] for line in actors.stdout.splitlines() if '"node_id"' in line}
-        assert len(homes) == 3, actors.stdout  # the learner on the head, work on both others
+        actors = network.run(
+            *ray, "list", "actors", "--address", "http://127.0.0.1:8265", "--format", "json", "--detail"
+        )
+        homes = {(actor["class_name"], actor["node_id"]) for actor in json.loads(actors.stdout)}
+        work = ("Learner", "AdaptationWorker", "SimulationWorker")
+        assert [len([home for home in homes if home[0] == name]) for name in work] == [1, 2, 2], actors.stdout
     except AssertionError as error:
         raise AssertionError(f"{error}\n{network.logs()}") from error
     finally:
