@@ -109,6 +109,8 @@ def commands(script: str) -> Iterator[list[str]]:
 def listening(arguments: Sequence[str]) -> set[int]:
     """Return the ports that a command line makes its program listen on, for others to speak to."""
     line = " ".join(arguments).replace("= ", "=")
-    named = re.findall(r"--?(?:port|dashboard-port|metrics-export-port|s3\.port|web\.listen-address)[= ](?:\S*:)?(\d+)\b", line)
+    named = re.findall(
+        r"--?(?:port|dashboard-port|metrics-export-port|s3\.port|web\.listen-address)[= ](?:\S*:)?(\d+)\b", line
+    )
     always = {"ray": {52365}}.get(arguments[0] if arguments else "", set())
     return {int(port) for port in named} | always | ({8265} if "--head" in arguments else set())

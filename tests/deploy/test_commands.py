@@ -9,8 +9,20 @@ import pytest
 
 from tests.deploy.command_lines import commands, refused
 from tests.deploy.manifests import (
-    DEPLOY, DOCKERFILE, JOBS, OVERLAYS, PROJECT, arrays, composed, containers, documents, overlay, stages,
+    DEPLOY,
+    DOCKERFILE,
+    JOBS,
+    OVERLAYS,
+    PROJECT,
+    arrays,
+    composed,
+    containers,
+    documents,
+    overlay,
+    stages,
 )  # fmt: skip
+
+pytestmark = pytest.mark.deploy
 
 PAGES = ("docs/deploy.md", "docs/operations.md")
 

@@ -9,6 +9,8 @@ import pytest
 from tests.deploy.command_lines import listening
 from tests.deploy.manifests import COMPOSE, DEPLOY, DOCKERFILE, ask, composed, documents, stages
 
+pytestmark = pytest.mark.deploy
+
 OTHERS = {"postgres": {5432}, "grafana": {3000}}
 """Ports of programs that need not be told."""
 WITHOUT_A_USER_OF_THEIR_IMAGE = {"prometheus", "grafana"}
@@ -31,7 +33,9 @@ def addresses() -> list[tuple[str, str, int]]:
         test = service.get("healthcheck", {}).get("test", [])
         texts = [*service.get("environment", {}).values(), *(service.get("command") or ()), *test]
         found += [(name, host, int(port)) for text in texts for host, port in ADDRESS.findall(str(text))]
-        found += [(name, host, int(port)) for text in texts for host, port in re.findall(r"^--address=(\w+):(\d+)", text)]
+        found += [
+            (name, host, int(port)) for text in texts for host, port in re.findall(r"^--address=(\w+):(\d+)", text)
+        ]
     (source,) = documents(DEPLOY / "grafana/provisioning/datasources/prometheus.yaml")[0]["datasources"]
     found += [("grafana", host, int(port)) for host, port in ADDRESS.findall(source["url"])]
     for scrape in documents(DEPLOY / "prometheus/prometheus.yaml")[0]["scrape_configs"]:
@@ -58,8 +62,12 @@ def test_docker_compose_takes_it():
 
 @pytest.mark.parametrize(
     ("before", "after"),
-    [("    healthcheck:", "    healthchecks:"), ("condition: service_healthy", "condition: healthy"), ("networks: [watch]", "networks: [watches]")],
-)  # fmt: skip
+    [
+        ("    healthcheck:", "    healthchecks:"),
+        ("condition: service_healthy", "condition: healthy"),
+        ("networks: [watch]", "networks: [watches]"),
+    ],
+)
 def test_docker_compose_finds_a_fault(tmp_path: Path, before: str, after: str):
     text = COMPOSE.read_text("utf-8")
     assert before in text
@@ -76,7 +84,8 @@ def test_services_speak_to_services_that_listen():
 
 
 @pytest.mark.parametrize(
-    "address", [("head", "mlfow", 5000), ("head", "mlflow", 5001), ("head", "postgres", 5432), ("grafana", "head", 8265)]
+    "address",
+    [("head", "mlfow", 5000), ("head", "mlflow", 5001), ("head", "postgres", 5432), ("grafana", "head", 8265)],
 )
 def test_an_address_where_nobody_listens_is_found(address: tuple[str, str, int]):
     assert complaint(*address)
@@ -123,13 +132,17 @@ def test_a_service_has_no_more_rights_than_it_needs(name: str):
 
 @pytest.mark.parametrize("name", sorted(set(services()) - {"bucket"}))
 def test_a_service_says_whether_it_is_well(name: str):
-    checked = {stage.name for stage in stages(DOCKERFILE.read_text("utf-8")).values() if "HEALTHCHECK" in str(stage.lines)}
+    checked = {
+        stage.name for stage in stages(DOCKERFILE.read_text("utf-8")).values() if "HEALTHCHECK" in str(stage.lines)
+    }
     image = services()[name]["image"].partition(":")[2]
     assert "healthcheck" in services()[name] or image in checked | {"cpu"}
 
 
 def test_nobody_starts_before_what_it_needs():
-    needs = {name: {n: how["condition"] for n, how in s.get("depends_on", {}).items()} for name, s in services().items()}
+    needs = {
+        name: {n: how["condition"] for n, how in s.get("depends_on", {}).items()} for name, s in services().items()
+    }
     well = "service_healthy"
     assert needs["mlflow"] == {"postgres": well, "bucket": "service_completed_successfully"}
     assert needs["bucket"] == {"store": well}
@@ -139,7 +152,7 @@ def test_nobody_starts_before_what_it_needs():
 
 
 def test_what_is_mounted_exists_and_what_is_kept_has_a_name():
-    volumes = {volume for volume in composed()["volumes"]}
+    volumes = set(composed()["volumes"])
     used = set()
     for service in services().values():
         for mount in service.get("volumes", ()):

@@ -12,8 +12,21 @@ import pytest
 
 from services.suites.rendering import BACKENDS
 from tests.deploy.manifests import (
-    DEPLOY, DOCKERFILE, OVERLAYS, PROJECT, Stage, arrays, ask, composed, containers, history, overlay, stages,
+    DEPLOY,
+    DOCKERFILE,
+    OVERLAYS,
+    PROJECT,
+    Stage,
+    arrays,
+    ask,
+    composed,
+    containers,
+    history,
+    overlay,
+    stages,
 )  # fmt: skip
+
+pytestmark = pytest.mark.deploy
 
 TARGETS = ("cpu", "cuda", "mlflow", "store")
 IMAGE = re.compile(r"^(?P<name>[\w./-]+):(?P<tag>[\w.-]+)(?:@sha256:[0-9a-f]{64})?$")

@@ -14,8 +14,19 @@ import yaml
 from services.actors.simulation import ENVIRONMENTS_KEPT
 from tests.deploy.command_lines import listening
 from tests.deploy.manifests import (
-    DEPLOY, JOBS, OVERLAYS, Container, Document, ask, containers, documents, overlay, rendered,
+    DEPLOY,
+    JOBS,
+    OVERLAYS,
+    Container,
+    Document,
+    ask,
+    containers,
+    documents,
+    overlay,
+    rendered,
 )  # fmt: skip
+
+pytestmark = pytest.mark.deploy
 
 SCHEMAS = Path(__file__).parent / "schemas"
 KUBERAY = {"RayCluster": "rayclusters.v1.json", "RayJob": "rayjobs.v1.json"}

@@ -9,9 +9,11 @@ from typing import Any
 
 import pytest
 from ray.dashboard.modules.reporter.reporter_agent import METRICS_GAUGES
-
 from services.metrics import MEASURES
+
 from tests.deploy.manifests import DEPLOY, PROJECT, ask, composed, documents
+
+pytestmark = pytest.mark.deploy
 
 PROMETHEUS, GRAFANA = DEPLOY / "prometheus", DEPLOY / "grafana"
 RULES = documents(PROMETHEUS / "alerts.yaml")[0]["groups"][0]["rules"]
@@ -76,7 +78,10 @@ def test_promtool_takes_the_configuration(name: str):
 def test_promtool_finds_a_fault(tmp_path: Path):
     folder = tmp_path / "prometheus"
     shutil.copytree(PROMETHEUS, folder)
-    for name, before, after in [("prometheus.yaml", "file_sd_configs", "file_sd"), ("alerts.yaml", "for: 8m", "for: soon")]:
+    for name, before, after in [
+        ("prometheus.yaml", "file_sd_configs", "file_sd"),
+        ("alerts.yaml", "for: 8m", "for: soon"),
+    ]:
         text = (PROMETHEUS / name).read_text("utf-8")
         (folder / name).write_text(text.replace(before, after))
         assert ask("promtool", "check", "config", folder / "prometheus.yaml")[0] != 0
@@ -96,7 +101,10 @@ def test_alerts_fire_when_they_should(tmp_path: Path):
     assert code == 0, output
 
 
-@pytest.mark.parametrize(("before", "after"), [("> 3600", "> 36000"), ("for: 8m", "for: 2m"), ("> 3 *", "> 0 *"), ("[15m])) > 0\n", "[15m])) > 999\n")])
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [("> 3600", "> 36000"), ("for: 8m", "for: 2m"), ("> 3 *", "> 0 *"), ("[15m])) > 0\n", "[15m])) > 999\n")],
+)
 def test_an_alert_that_fires_otherwise_is_found(before: str, after: str, tmp_path: Path):
     text = (PROMETHEUS / "alerts.yaml").read_text("utf-8")
     assert before in text
@@ -130,7 +138,9 @@ def test_a_query_for_what_nobody_exports_is_found(query: str, word: str):
 
 
 def test_the_dashboard_asks_the_provisioned_source():
-    provisioned = {source["uid"] for source in documents(GRAFANA / "provisioning/datasources/prometheus.yaml")[0]["datasources"]}
+    provisioned = {
+        source["uid"] for source in documents(GRAFANA / "provisioning/datasources/prometheus.yaml")[0]["datasources"]
+    }
     asked = list(sources(DASHBOARD))
     assert set(asked) == provisioned
     assert len(asked) > 2 * len(DASHBOARD["panels"])

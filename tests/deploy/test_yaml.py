@@ -2,7 +2,11 @@
 
 from pathlib import Path
 
+import pytest
+
 from tests.deploy.manifests import DEPLOY, PROJECT, ask
+
+pytestmark = pytest.mark.deploy
 
 RULES = PROJECT / ".yamllint"
 
