@@ -4,7 +4,7 @@ BIN := .venv/bin
 INSTALLED := .venv/installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train cluster cluster-stop test audit clean
+.PHONY: help setup train cluster cluster-stop test check-deploy audit clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):[^#]*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -37,8 +37,15 @@ test: setup ## lint, format, types, then every test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
-	$(BIN)/python -m pytest -m "not alone" -n 2 --dist loadfile --durations 10
+	$(BIN)/python -m pytest -m "not alone and not deploy" -n 2 --dist loadfile --durations 10
 	$(BIN)/python -m pytest -m alone --durations 20
+
+check-deploy: setup ## hold everything in deploy/ against schemas, checkers and the project itself; no container engine
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,deploy]'
+	@command -v promtool >/dev/null || { echo "check-deploy: found no promtool: apt-get install prometheus"; exit 1; }
+	@command -v kubectl >/dev/null || \
+		{ echo "check-deploy: found no kubectl, 1.27 or newer, to render overlays: https://kubernetes.io/docs/tasks/tools"; exit 1; }
+	$(BIN)/python -m pytest -m deploy tests/deploy
 
 audit: setup ## ask PyPI for known vulnerabilities of every pinned dependency; options go in ARGS, as ARGS="-s osv"
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[audit]'

@@ -149,7 +149,8 @@ def test_a_job_on_two_raylets_becomes_a_finished_run_of_mlflow_on_postgres(
             "--runs", str(workplace / "runs"), "--name", "job",
         )  # fmt: skip
         assert submitted.returncode == 0, submitted.stdout + submitted.stderr
-        look = "r = c.search_runs([c.get_experiment_by_name('dmil-ml10').experiment_id]); print([x.info.status for x in r])"
+        runs = "c.search_runs([c.get_experiment_by_name('dmil-ml10').experiment_id])"
+        look = f"print([run.info.status for run in {runs}])"
         assert network.run(sys.executable, "-c", client + look).stdout.strip() == "['FINISHED']"
         actors = network.run(
             *ray, "list", "actors", "--address", "http://127.0.0.1:8265", "--format", "json", "--detail"
