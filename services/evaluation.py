@@ -39,8 +39,9 @@ class Tallies:
         self._counts: dict[tuple[Split, int], tuple[int, int]] = {}
 
     def __iter__(self) -> Iterator[Tally]:
-        """Go through the counts so far."""
-        return iter([Tally(*where, *counts) for where, counts in list(self._counts.items())])
+        """Go through the counts so far, those of meta-training tasks first."""
+        found = [Tally(*where, *counts) for where, counts in list(self._counts.items())]
+        return iter(sorted(found, key=lambda tally: (tally.split == "meta-testing", tally.shots)))
 
     def add(self, trial: Trial, outcome: TrialOutcome) -> None:
         """Count a trial's episodes."""

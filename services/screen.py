@@ -15,8 +15,8 @@ from services.palette import colour_of
 
 __all__ = ["Figures", "Pace", "Screen", "Strip", "Tally", "Workers"]
 
-LABEL, WIDEST = 14, 100
-"""Columns of the labels, and of the whole: wider lines are hard to read."""
+LABEL, WIDEST = 14, 80
+"""Columns of the labels, and of the whole: a wider screen would leave parts behind when its terminal gets narrower."""
 NEAR = 0.01
 """A sub-skill with a smaller share of the states is hardly in use."""
 
@@ -111,6 +111,7 @@ class Figures(NamedTuple):
             [
                 *([f"loss {_short(self.losses['loss'])}"] if "loss" in self.losses else []),
                 *([f"sub-skills in use {used}/{len(self.shares)}"] if len(self.shares) > 1 else []),
+                *([f"after {self.after}"] if self.success and self.after is not None else []),
                 *(f"{tally.split} {tally.in_words}" for tally in self.success),
                 *([f"workers restarted {restarted}"] if restarted else []),
                 *([self.at] if self.at else []),
