@@ -1,10 +1,12 @@
 """What a run tells Ray of itself arrives at the endpoint that Prometheus asks, with the right counts."""
 
+import logging
 import os
 import re
 import signal
 import time
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -32,12 +34,21 @@ def scraped(port: int) -> Series:
 
 
 def key(name: str, **labels: str) -> tuple[str, frozenset[tuple[str, str]]]:
-    return f"ray_{name}", frozenset({"suite": "ml10", **labels}.items())
+    return f"ray_{name}", frozenset({"suite": "ml10-part", **labels}.items())
+
+
+@pytest.fixture
+def port(joined) -> Iterator[int]:
+    """Of the endpoint; this process stays in the cluster during the whole test."""
+    ray.init(logging_level=logging.WARNING, log_to_driver=False)
+    yield ray.nodes()[0]["MetricsExportPort"]
+    ray.shutdown()
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("joined")
-def test_a_run_with_a_killed_worker_arrives(train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wait_for):
+def test_a_run_with_a_killed_worker_arrives(
+    port: int, train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wait_for
+):
     note, began = tmp_path / "killed", time.time()
 
     class Mortal(AdaptationWorker):
@@ -50,8 +61,6 @@ def test_a_run_with_a_killed_worker_arrives(train, tmp_path: Path, monkeypatch: 
             return super().gradient(parameters, iteration, tasks, block, before)
 
     monkeypatch.setattr("services.ray_meta_training.AdaptationWorker", Mortal)
-    ray.init(log_to_driver=False)
-    port = ray.nodes()[0]["MetricsExportPort"]
     arguments = ["--workers", "2", "--training.tasks-per-iteration", "5", "--training.slots-per-group", "1"]
     train("run", "--runner", "ray", "--training.iterations", "6", *arguments)
 
@@ -62,8 +71,6 @@ def test_a_run_with_a_killed_worker_arrives(train, tmp_path: Path, monkeypatch: 
         return key("dmil_success_rate", split="meta-testing", shots="1") in found
 
     wait_for(arrived, "the metrics", 60)
-    ray.shutdown()
-
     assert found[key("dmil_iterations_total")] == 6
     assert found[key("dmil_iteration_seconds_count")] == 6
     phases = [found[key("dmil_phase_seconds_total", phase=phase)] for phase in ("broadcast", "compute", "step")]
