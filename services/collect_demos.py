@@ -17,7 +17,7 @@ from rich.table import Table
 
 from dmil_core.configs import ExperimentConfig
 from services import inspect_demos, record_demos, verify_experts
-from services.command_line import DEFAULT_PRESET, defaults_from, exit_code, parse
+from services.command_line import DEFAULT_PRESET, Quiet, defaults_from, exit_code, parse
 from services.demo_store import TaskDemonstrations, open_store
 from services.experiment import Experiment, RunnerKind, open_runner
 from services.progress import Clock, console
@@ -42,6 +42,7 @@ class Arguments:
     """Where to work: in Ray actors, or in this process; the demonstrations are the same to the byte."""
     workers: int | None = None
     """Ray workers, one for each CPU of the cluster if not given."""
+    quiet: Quiet = False
 
 
 OTHERS = {"verify": verify_experts.run, "inspect": inspect_demos.run, "record": record_demos.run}

@@ -1,7 +1,8 @@
 """Where an experiment's demonstrations come from: the store, data sets of one's own, or the scripted experts."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
+from contextlib import closing
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import DemonstrationError
@@ -10,6 +11,7 @@ from services.failures import keeping_failures
 from services.progress import Bar
 from services.recordings import check_dimensions, demonstrations, places_of
 from services.runners import Runner
+from services.screen import Figures
 from services.suites.base import Attempt, TaskSuite
 
 __all__ = ["DemonstrationCollection"]
@@ -61,16 +63,17 @@ class DemonstrationCollection:
                 )
             else:
                 missing.append(task)
-        for task, attempts in self._attempt(runner, missing):
-            solved = [index for index, attempt in enumerate(attempts) if attempt.solved_at is not None]
-            kept = solved[: settings.per_task]
-            found[task] = self._store.save(
-                ids[task],
-                task,
-                [attempts[index] for index in kept],
-                failed=kept[-1] + 1 - len(kept),
-                settings={"protocol": self._suite.protocol, **settings.model_dump()},
-            )
+        with closing(self._attempt(runner, missing)) as made:  # whatever happens here, its progress is off the screen
+            for task, attempts in made:
+                solved = [index for index, attempt in enumerate(attempts) if attempt.solved_at is not None]
+                kept = solved[: settings.per_task]
+                found[task] = self._store.save(
+                    ids[task],
+                    task,
+                    [attempts[index] for index in kept],
+                    failed=kept[-1] + 1 - len(kept),
+                    settings={"protocol": self._suite.protocol, **settings.model_dump()},
+                )
         return {task: found[task] for task in self._names}
 
     def _checked(self, dataset: TaskDemonstrations) -> TaskDemonstrations:
@@ -111,7 +114,7 @@ class DemonstrationCollection:
                 )
         return found
 
-    def _attempt(self, runner: Runner, tasks: Sequence[str]) -> Iterator[tuple[str, list[Attempt]]]:
+    def _attempt(self, runner: Runner, tasks: Sequence[str]) -> Generator[tuple[str, list[Attempt]]]:
         """Yield each task's attempts as soon as enough are successes, in the order of their numbers."""
         if not tasks:
             return
@@ -121,7 +124,12 @@ class DemonstrationCollection:
         def lacking(task: str) -> int:
             return settings.per_task - sum(attempt.solved_at is not None for attempt in attempts[task])
 
-        with Bar("collecting", len(tasks) * settings.per_task) as bar:
+        at = ""
+
+        def figures() -> Figures:
+            return Figures(workers=runner.staff, at=at)
+
+        with Bar("collecting", len(tasks) * settings.per_task, 0, "demonstrations", figures) as bar:
             while attempts:
                 calls = []
                 for task in attempts:
@@ -141,7 +149,8 @@ class DemonstrationCollection:
                         task = calls[index][0]
                         results[index] = made
                         left[task] -= 1
-                        bar.advance(sum(attempt.solved_at is not None for attempt in made), task)
+                        at = task
+                        bar.advance(sum(attempt.solved_at is not None for attempt in made))
                         if not left[task]:
                             own = [number for number, call in enumerate(calls) if call[0] == task]
                             attempts[task] += [attempt for number in own for attempt in results.pop(number)]

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Annotated, Any, NoReturn, TypeVar
 
 import tyro
 from pydantic import ValidationError
@@ -22,10 +22,12 @@ from dmil_core.configs import (
 )
 from dmil_core.errors import RunError, UserError, explain, shown
 from dmil_core.methods.registry import MethodError
+from services.progress import console
 from services.settings_files import ConfigError, merged, read_yaml
 
 __all__ = [
     "ConfigError",
+    "Quiet",
     "checked",
     "config_from",
     "defaults_from",
@@ -39,6 +41,14 @@ __all__ = [
 ]
 
 T = TypeVar("T")
+Quiet = Annotated[
+    bool,
+    tyro.conf.arg(
+        help="In place of the live screen a plain line every few seconds, as where the output is no terminal; and of "
+        "messages only warnings, results and errors."
+    ),
+]
+"""The flag ``--quiet`` of programs that take long; `parse` sees to it."""
 DEFAULT_SUITE, DEFAULT_PRESET = "ml10", "quick"
 PROGRAMS = {
     "meta-train": "collect demonstrations, meta-train, evaluate",
@@ -163,9 +173,11 @@ def parse(program: type[T], description: str, arguments: Sequence[str], defaults
     """
     module = program.__module__ if program.__module__ != "__main__" else f"services.{Path(sys.argv[0]).stem}"
     try:
-        return tyro.cli(program, prog=f"python -m {module}", args=arguments, description=description, default=defaults)
+        given = tyro.cli(program, prog=f"python -m {module}", args=arguments, description=description, default=defaults)
     except ValidationError as error:
         raise ConfigError(explain(error)) from error
+    console.terse = getattr(given, "quiet", False)
+    return given
 
 
 def exit_code(program: Callable[[Sequence[str]], None], arguments: Sequence[str]) -> int:

@@ -12,7 +12,7 @@ import tyro
 
 from dmil_core.configs import EvaluationConfig
 from services.checkpoints import Checkpoint, Checkpoints
-from services.command_line import exit_code, parse, peek, with_evaluation
+from services.command_line import Quiet, exit_code, parse, peek, with_evaluation
 from services.demo_store import open_store
 from services.experiment import Experiment, RunnerKind, open_runner
 from services.progress import Clock
@@ -37,6 +37,7 @@ class Arguments:
     """Where to work: in Ray actors, or in this process; the result is the same."""
     workers: int | None = None
     """Ray workers, one for each CPU of the cluster if not given."""
+    quiet: Quiet = False
 
 
 def run(arguments: Sequence[str]) -> None:

@@ -1,6 +1,6 @@
 """Evaluations of checkpoints: who is tried out on what, the rows that come of it, and those made on the way."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -16,16 +16,46 @@ from dmil_core.settings import sub_skills_of
 from services.checkpoints import Checkpoint, Checkpoints
 from services.demo_store import TaskDemonstrations
 from services.failures import keeping_failures
+from services.metrics import EPISODES, SUCCESS_RATE, SUCCESSES, Meter
 from services.progress import console
 from services.provenance import library_versions
 from services.results import AdaptationResult, EpisodeResult, Split, write_rows
 from services.rollouts import Trial, TrialOutcome, trials
 from services.runners import Runner, Simulation
+from services.screen import Tally
 from services.suites.base import TaskSuite
 from services.summary import Evaluation, cells, rates, sub_skill_use
 from services.tracking import Tracker
 
-__all__ = ["Evaluations", "Evaluator", "write_evaluation"]
+__all__ = ["Evaluations", "Evaluator", "Tallies", "write_evaluation"]
+
+
+class Tallies:
+    """Counts the episodes of an evaluation as they come, by split and size of support set."""
+
+    def __init__(self, meter: Meter) -> None:
+        """Count none yet."""
+        self._meter = meter
+        self._counts: dict[tuple[Split, int], tuple[int, int]] = {}
+
+    def __iter__(self) -> Iterator[Tally]:
+        """Go through the counts so far, those of meta-training tasks first."""
+        found = [Tally(*where, *counts) for where, counts in list(self._counts.items())]
+        return iter(sorted(found, key=lambda tally: (tally.split == "meta-testing", tally.shots)))
+
+    def add(self, trial: Trial, outcome: TrialOutcome) -> None:
+        """Count a trial's episodes."""
+        successes, episodes = sum(episode.success for episode in outcome.episodes), len(outcome.episodes)
+        before = self._counts.get((trial.split, trial.shots), (0, 0))
+        self._counts[trial.split, trial.shots] = before[0] + successes, before[1] + episodes
+        self._meter.record(EPISODES, float(episodes), split=trial.split, shots=str(trial.shots))
+        self._meter.record(SUCCESSES, float(successes), split=trial.split, shots=str(trial.shots))
+
+    def finish(self) -> None:
+        """Tell the success rates, now that all episodes are counted."""
+        for tally in self:
+            rate = tally.successes / tally.episodes
+            self._meter.record(SUCCESS_RATE, rate, split=tally.split, shots=str(tally.shots))
 
 
 class Evaluator:
@@ -120,6 +150,8 @@ class Evaluations:
         self._overlap = overlap
         checkpoints.spares = lambda iteration: self.is_due(iteration) and not self._is_made(iteration)
         self._under_way: tuple[Checkpoint, Simulation] | None = None
+        self.found: dict[str, Any] = {}
+        """What the last one found, as `Figures` have it: the ``success``, and ``after`` how many iterations."""
 
     def is_due(self, iteration: int) -> bool:
         """Tell whether the checkpoint of an iteration is evaluated on the way; the last one is when all is over."""
@@ -166,10 +198,15 @@ class Evaluations:
         iteration = checkpoint.manifest.iteration
         evaluation = self._evaluator.evaluation(checkpoint, outcomes)
         write_evaluation(evaluation, self._folder / f"{iteration:07d}")
+        tallies = Tallies(self._runner.meter)
+        for trial, outcome in zip(self._evaluator.trials, outcomes, strict=True):
+            tallies.add(trial, outcome)
+        tallies.finish()
+        self.found = {"success": list(tallies), "after": iteration}
         found = cells(evaluation.episodes, evaluation.best_score, self._evaluator.config.method)
         self._tracker.metrics(iteration, rates(found, sub_skill_use(evaluation.adaptations)))
         in_words = "; ".join(f"{cell.split} {cell.shots}-shot {cell.success_rate:.3f}" for cell in found)
-        console.print(f"success rates after {iteration} iterations: {in_words}")
+        console.note(f"success rates after {iteration} iterations: {in_words}")
 
 
 def write_evaluation(evaluation: Evaluation, folder: Path) -> None:

@@ -1,5 +1,7 @@
 """One experiment, put together from its config once, for all programs: collect, meta-train, evaluate."""
 
+import time
+from collections import deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,18 +18,20 @@ from dmil_core.methods.registry import method_type
 from dmil_core.networks import Parameters, flatten, unflatten
 from dmil_core.outer_loop import OuterState
 from dmil_core.seeding import stream
-from dmil_core.statistics import share_entropy
 from services.checkpoints import Checkpoint, CheckpointError, Checkpoints, Manifest
 from services.collection import DemonstrationCollection
 from services.demo_store import DemoStore, TaskDemonstrations
-from services.evaluation import Evaluations, Evaluator, write_evaluation
+from services.evaluation import Evaluations, Evaluator, Tallies, write_evaluation
 from services.failures import keeping_failures
+from services.iteration_metrics import figures_of, iteration_metrics, nonfinite_in_words, shares_of
+from services.metrics import CHECKPOINT_TIME, SPOOL_RECORDS
 from services.progress import Bar, console
 from services.provenance import library_versions
 from services.ray_runner import RayRunner
 from services.results import Split
 from services.rollouts import TrialOutcome
-from services.runners import Iteration, LocalRunner, Plan, Runner
+from services.runners import LocalRunner, Plan, Runner
+from services.screen import Figures
 from services.suites.base import TaskSuite
 from services.suites.registry import open_suite
 from services.summary import AGAINST_COLLAPSE, COLLAPSED, Evaluation
@@ -45,6 +49,8 @@ __all__ = [
 
 RunnerKind = Literal["ray", "local"]
 OnNonfinite = Literal["stop", "skip"]
+RECENT = 50
+"""So many iterations are behind the losses and the use of sub-skills on the screen."""
 COLLAPSED_ITERATIONS = 100
 """So long may one sub-skill take nearly all states before a warning."""
 
@@ -89,7 +95,7 @@ class CollapseWatch:
 
     def look(self, iteration: int, metrics: Mapping[str, float]) -> str | None:
         """Return the warning, when it is due after an iteration with these metrics."""
-        shares = _shares(metrics)
+        shares = shares_of(metrics)
         collapsed = len(shares) > 1 and shares.max() > COLLAPSED
         self._iterations = self._iterations + 1 if collapsed else 0
         if self._told or self._iterations < COLLAPSED_ITERATIONS:
@@ -222,7 +228,10 @@ class Experiment:
                 mlflow_run_id=tracker.identify(patience=20.0 if state.iteration == settings.iterations else 0.0),
             )
             arrays = {name: tensor.numpy() for name, tensor in parameters.items()}
-            return checkpoints.save(state, arrays, method.constants(), manifest)
+            path = checkpoints.save(state, arrays, method.constants(), manifest)
+            runner.meter.record(CHECKPOINT_TIME, time.time())
+            console.note(f"checkpoint: {path}")
+            return path
 
         evaluations = Evaluations(
             runner,
@@ -242,7 +251,11 @@ class Experiment:
         training = runner.meta_train(plan)
         collapse = CollapseWatch()
         losses: list[float] = []
+        recent: deque[Mapping[str, float]] = deque(maxlen=RECENT)
         path, saved = None, -1
+
+        def figures() -> Figures:
+            return figures_of(list(recent))._replace(**evaluations.found, workers=runner.staff)
 
         def save_now() -> Path | None:
             state = training.state()
@@ -251,16 +264,17 @@ class Experiment:
             return save(state, float(np.mean(losses)) if losses else None)
 
         try:
+            runner.meter.record(CHECKPOINT_TIME, time.time())
             with (
-                Bar("meta-training", settings.iterations, state.iteration) as bar,
+                Bar("meta-training", settings.iterations, state.iteration, "iterations", figures) as bar,
                 keeping_failures(checkpoints.folder.parent, self.config, save_now),
             ):
                 for iteration in training.iterations(settings.iterations - state.iteration):
                     done = iteration.number
-                    metrics = _iteration_metrics(iteration)
+                    metrics = iteration_metrics(iteration)
                     environment_steps += int(metrics.get("environment_steps", 0))
                     if not iteration.stepped:
-                        told = _nonfinite_in_words(iteration)
+                        told = nonfinite_in_words(iteration)
                         if on_nonfinite == "stop":
                             save_now()
                             raise NonFiniteError(told, checkpoints.folder.parent)
@@ -268,7 +282,9 @@ class Experiment:
                     else:
                         losses.append(metrics["loss"])
                     tracker.metrics(done, {name: value for name, value in metrics.items() if np.isfinite(value)})
-                    bar.advance(1, _in_words(metrics))
+                    runner.meter.record(SPOOL_RECORDS, float(tracker.waiting))
+                    recent.append(metrics)
+                    bar.advance(1)
                     if warning := collapse.look(done, metrics):
                         console.print(f"warning: {warning}")
                         tracker.tags({"warning.collapse": warning})
@@ -309,14 +325,22 @@ class Experiment:
         """
         evaluator = self.evaluator(runner, data, only)
         outcomes: dict[int, TrialOutcome] = {}
-        successes = 0
-        episodes = sum(len(trial.episodes) for trial in evaluator.trials)
-        with Bar("evaluating", episodes) as bar, keeping_failures(folder, self.config, lambda: checkpoint.path):
+        tallies, at = Tallies(runner.meter), ""
+
+        def figures() -> Figures:
+            return Figures(success=list(tallies), workers=runner.staff, at=at)
+
+        with (
+            Bar("evaluating", sum(len(trial.episodes) for trial in evaluator.trials), 0, "episodes", figures) as bar,
+            keeping_failures(folder, self.config, lambda: checkpoint.path),
+        ):
             for index, outcome in runner.simulate("try_out", evaluator.calls(checkpoint)):
                 outcomes[index] = outcome
-                successes += sum(episode.success for episode in outcome.episodes)
                 trial = evaluator.trials[index]
-                bar.advance(len(trial.episodes), f"{successes} solved; {trial.task}")
+                tallies.add(trial, outcome)
+                at = trial.task
+                bar.advance(len(trial.episodes))
+        tallies.finish()
         evaluation = evaluator.evaluation(checkpoint, [outcomes[index] for index in range(len(evaluator.trials))])
         write_evaluation(evaluation, folder)
         return evaluation
@@ -341,35 +365,3 @@ def _same_data(resume: Checkpoint | None, digests: Mapping[str, str], store: Dem
             f"{resume.path}: trained on other demonstrations of {', '.join(changed)} than the store {store.root} "
             "holds; point DMIL_DATA to those it was trained on"
         )
-
-
-def _nonfinite_in_words(iteration: Iteration) -> str:
-    slots = "; ".join(
-        f"slot {slot.slot}, task {slot.task}, demonstrations {', '.join(dict.fromkeys(slot.demonstrations))}"
-        for slot in iteration.spoilt
-    )
-    return f"iteration {iteration.number}: a loss or a gradient is not finite in {slots or 'the sum over all slots'}"
-
-
-def _iteration_metrics(iteration: Iteration) -> dict[str, float]:
-    """Return an iteration's metrics: the means over its slots, what they say together, and how fast it went."""
-    metrics = {name: float(np.mean([slot[name] for slot in iteration.slots])) for name in iteration.slots[0]}
-    if "environment_steps" in metrics:
-        metrics["environment_steps"] *= len(iteration.slots)
-    if len(shares := _shares(metrics)) > 1:
-        metrics["sub_skill_entropy"] = share_entropy(shares)
-    return metrics | {
-        "gradient_norm": iteration.gradient_norm,
-        "iterations_per_second": 1 / iteration.timing.iteration,
-        "overhead_share": iteration.timing.overhead_share,
-    }
-
-
-def _shares(metrics: Mapping[str, float]) -> np.ndarray:
-    return np.array([share for name, share in metrics.items() if name.startswith("sub_skill_share/")])
-
-
-def _in_words(metrics: Mapping[str, float]) -> str:
-    shares = _shares(metrics)
-    in_use = f"sub-skills in use {(shares > 0.01).sum()}/{len(shares)}; " if len(shares) > 1 else ""
-    return f"loss {metrics['loss']:.3f}; {in_use}{metrics['iterations_per_second']:.1f} iterations/s"

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from dmil_core.configs import DEFAULT_METHOD, ExperimentConfig
 from dmil_core.errors import explain
 from services.checkpoints import Checkpoint, Checkpoints
-from services.command_line import DEFAULT_PRESET, ConfigError, defaults_from, exit_code, parse, peek
+from services.command_line import DEFAULT_PRESET, ConfigError, Quiet, defaults_from, exit_code, parse, peek
 from services.demo_store import open_store
 from services.disk import read_file, write_file
 from services.experiment import Experiment, OnNonfinite, RunnerKind, open_runner
@@ -71,6 +71,7 @@ class Arguments:
     """Name of the run's folder; the suite's and the preset's with the time if not given."""
     resume: str | None = None
     """Name or folder of a run to go on with, with its own settings."""
+    quiet: Quiet = False
 
 
 def run(arguments: Sequence[str]) -> None:

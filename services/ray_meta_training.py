@@ -9,6 +9,7 @@ from dmil_core.outer_loop import OuterState, blocks, groups, slot_in_words
 from services.actors.adaptation import AdaptationWorker, BlockReport
 from services.actors.faults import DeadlyCallError, LostError
 from services.actors.learner import Learner, StepReport
+from services.metrics import Crew, Meter
 from services.progress import console
 from services.runners import Iteration, Plan
 from services.timing import Span, Timing
@@ -46,7 +47,14 @@ class RayMetaTraining:
     last asked for, a checkpoint's, and does the iterations since again: they give the same bits.
     """
 
-    def __init__(self, plan: Plan, workers: int | Callable[[], int], fan_in: int = FAN_IN, gpus: float = 0.0) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        workers: int | Callable[[], int],
+        fan_in: int = FAN_IN,
+        gpus: float = 0.0,
+        meter: Meter | None = None,
+    ) -> None:
         """Start the actors; the demonstrations travel to each node once.
 
         Args:
@@ -55,6 +63,7 @@ class RayMetaTraining:
                 are groups are started.
             fan_in: gradients that a worker adds at a time, a power of two.
             gpus: of each adaptation worker.
+            meter: is told of iterations, workers, and slots that are done again.
         """
         import ray
 
@@ -62,6 +71,9 @@ class RayMetaTraining:
 
         self._ray, self._plan, self._fan_in = ray, plan, fan_in
         self._groups = groups(plan.settings)
+        self._meter = meter or Meter()
+        self.crew = Crew("adaptation", self._meter)
+        """Counts the workers."""
         self._workers: Callable[[], int] = workers if callable(workers) else lambda: workers
         remote, shared = ray.remote(num_cpus=1, num_gpus=gpus)(AdaptationWorker), ray.put(plan.demonstrations)
         self._pool = Pool(
@@ -69,8 +81,10 @@ class RayMetaTraining:
             size=self._wanted,
             ahead=2,
             say=console.print,
+            witness=self.crew,
         )
         self._kept, self._done, self._told = plan.state, plan.state.iteration, plan.state.iteration
+        self._begun = self._done
         self._losses: Counter[int] = Counter()
         self._suspicions: Counter[int] = Counter()
         self._ahead: Gradients | None = None
@@ -105,6 +119,7 @@ class RayMetaTraining:
             for iteration in self._run(end):
                 if iteration.number > self._told:
                     self._told = iteration.number
+                    self._meter.iteration(iteration.timing)
                     yield iteration
 
     def _run(self, end: int) -> Iterator[Iteration]:
@@ -133,6 +148,9 @@ class RayMetaTraining:
         """
         self._pool.grow(self._wanted)
         tasks, found, few = self._plan.tasks(iteration), self.blocks, self._fan_in
+        if iteration < self._begun:  # it was lost with the learner
+            self.crew.redone(len(tasks))
+        self._begun = max(self._begun, iteration + 1)
         side_by_side = len(found) <= len(self)
         calls: list[Call] = []
         for index, block in enumerate(found):

@@ -9,9 +9,11 @@ from dmil_core.errors import WorkError
 from services.actors.faults import DeadlyCallError, NoRoomError
 from services.actors.simulation import SimulationWorker, piece_of_call
 from services.cluster import cpus, joined
+from services.metrics import Crew, Meter, RayMeter
 from services.progress import console
 from services.ray_meta_training import RayMetaTraining
 from services.runners import Plan
+from services.screen import Workers
 from services.suites.base import TaskSuite
 
 if TYPE_CHECKING:
@@ -46,6 +48,8 @@ class RayRunner:
         if workers is not None and workers > cpus():
             self._cluster.close()
             raise NoRoomError(f"--workers: got {workers}; the cluster has {cpus()} CPUs; ask for at most as many")
+        self.meter: Meter = RayMeter(suite.name)
+        self._crew = Crew("simulation", self.meter)
         self._suite = ray.put(suite)
         self._beside: Pool | None = None
         self._training: RayMetaTraining | None = None
@@ -56,6 +60,12 @@ class RayRunner:
         there = cpus()
         return min(self._asked_for or there, there)
 
+    @property
+    def staff(self) -> list[Workers]:
+        """The workers of each kind that there are, or were."""
+        crews = [self._crew] if self._training is None else [self._training.crew, self._crew]
+        return [crew.workers for crew in crews if crew.workers != (crew.workers.kind, 0, 0)]
+
     def share(self, value: Any) -> Any:
         """Put `value` into the object store."""
         return self._ray.put(value)
@@ -64,7 +74,8 @@ class RayRunner:
         """Spread the calls over the simulation workers."""
         # While meta-training pauses, its workers keep their CPUs: the simulation's must not wait for one.
         remote = self._ray.remote(num_cpus=0 if self._meta_training() else 1)(SimulationWorker)
-        pool = self._pool(lambda: remote.remote(self._suite), min(self.workers, len(calls)), say=console.print)
+        size = min(self.workers, len(calls))
+        pool = self._pool(lambda: remote.remote(self._suite), size, say=console.print, witness=self._crew)
         try:
             with naming_the_deadly():
                 yield from pool.results(_submitted(pool, method, calls))
@@ -75,12 +86,14 @@ class RayRunner:
         """Let one more worker make the calls, which gives way to meta-training and takes no CPU from its count."""
         if self._beside is None:
             remote = self._ray.remote(num_cpus=0)(PoliteSimulationWorker)
-            self._beside = self._pool(lambda: remote.remote(self._suite), 1, ahead=len(calls), say=console.print)
+            self._beside = self._pool(
+                lambda: remote.remote(self._suite), 1, ahead=len(calls), say=console.print, witness=self._crew
+            )
         return RaySimulation(self._beside, method, calls)
 
     def meta_train(self, plan: Plan) -> "RayMetaTraining":
         """Start the learner and the adaptation workers."""
-        self._training = RayMetaTraining(plan, lambda: self.workers, gpus=self._gpus)
+        self._training = RayMetaTraining(plan, lambda: self.workers, gpus=self._gpus, meter=self.meter)
         return self._training
 
     def _meta_training(self) -> bool:

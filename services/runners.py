@@ -16,6 +16,8 @@ from dmil_core.outer_loop import OuterState, SpoiltSlot, groups, tasks_of
 from services.actors.adaptation import AdaptationWorker
 from services.actors.learner import Learner
 from services.actors.simulation import SimulationWorker
+from services.metrics import Meter
+from services.screen import Workers
 from services.suites.base import TaskSuite
 from services.timing import Timing
 
@@ -94,6 +96,16 @@ class Runner(Protocol):
     """Does an experiment's work, wherever that is."""
 
     @property
+    def meter(self) -> Meter:
+        """Takes what is counted and measured of the work."""
+        ...
+
+    @property
+    def staff(self) -> Sequence[Workers]:
+        """The workers that there are beside this process."""
+        ...
+
+    @property
     def workers(self) -> int:
         """How many workers of each kind there may be now."""
         ...
@@ -137,6 +149,8 @@ class LocalRunner:
     """Does all work in this process: for tests, debuggers and notebooks."""
 
     workers = 1
+    meter = Meter()
+    staff = ()
 
     def __init__(self, suite: TaskSuite) -> None:
         """Work on the tasks of `suite`."""

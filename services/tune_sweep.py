@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from dmil_core.errors import RunError, explain
 from services.cluster import joined
-from services.command_line import ConfigError, exit_code, parse
+from services.command_line import ConfigError, Quiet, exit_code, parse
 from services.demo_store import open_store
 from services.experiment import Experiment
 from services.folders import find_folder, new_folder
@@ -54,6 +54,7 @@ class Arguments:
     """Name of the sweep's folder; that of its file and the scale with the time if not given."""
     resume: str | None = None
     """Name or folder of a sweep to go on with: what is finished stays, what failed or was cut off goes on."""
+    quiet: Quiet = False
 
 
 def run(arguments: Sequence[str]) -> None:

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from dmil_core.errors import RunError, WorkError
 from dmil_core.statistics import success_rate
-from services.command_line import ConfigError, exit_code, parse, suite_settings
+from services.command_line import ConfigError, Quiet, exit_code, parse, suite_settings
 from services.experiment import RunnerKind, open_runner
 from services.progress import Bar, console
 from services.suites.base import TaskSuite
@@ -40,6 +40,7 @@ class Arguments:
     """Where to work: in Ray actors, or in this process."""
     workers: int | None = None
     """Ray workers, one for each CPU of the cluster if not given."""
+    quiet: Quiet = False
 
 
 def run(arguments: Sequence[str]) -> None:

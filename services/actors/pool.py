@@ -13,6 +13,7 @@ from ray.exceptions import ObjectLostError, RayActorError, RayError, RayTaskErro
 from dmil_core.errors import RunError
 from services.actors.calls import Call, Worker, now
 from services.actors.faults import DeadlyCallError, LostError, NoRoomError
+from services.actors.witness import Witness
 
 __all__ = ["Pool"]
 
@@ -42,7 +43,12 @@ class Pool:
     """
 
     def __init__(
-        self, make: Callable[[], Any], size: int, ahead: int = 1, say: Callable[[str], None] = lambda words: None
+        self,
+        make: Callable[[], Any],
+        size: int,
+        ahead: int = 1,
+        say: Callable[[str], None] = lambda words: None,
+        witness: Witness | None = None,
     ) -> None:
         """Start `size` actors and wait until all are up.
 
@@ -50,12 +56,13 @@ class Pool:
             make: starts one.
             size: how many.
             ahead: calls that an actor may hold at a time. With 2 it has its next one at hand when it ends one.
-            say: is told of actors lost, slow and replaced.
+            say: is told of actors lost, slow and replaced, in words.
+            witness: is told so too, to count them.
 
         Raises:
             NoRoomError: if the cluster cannot place them.
         """
-        self._make, self._ahead, self._say = make, ahead, say
+        self._make, self._ahead, self._say, self._witness = make, ahead, say, witness or Witness()
         self._workers: list[Worker] = []
         self._starting: dict[ray.ObjectRef, Worker] = {}
         self._waiting: list[Call] = []
@@ -167,6 +174,7 @@ class Pool:
 
     def retry(self, call: Call) -> None:
         """Have a call made again that was suspected to end its actors."""
+        self._witness.again(call)
         call.deaths = 0
         self._queue(call)
         self._send_waiting()
@@ -184,6 +192,8 @@ class Pool:
         self.drop()
         for worker in self._workers:
             ray.kill(worker.actor)
+            if worker.up:
+                self._witness.left()
         self._workers, self._starting = [], {}
 
     # Actors
@@ -208,20 +218,27 @@ class Pool:
                     call.spare, call.began = None, None
         else:
             self._failed_starts, worker.up = 0, True
+            if worker in self._workers:
+                self._witness.joined()
 
     def _replace(self, worker: Worker) -> None:
         """End an actor that is dead, slow or out of reach; its calls are queued again, and another takes its place."""
         ray.kill(worker.actor)
         self.restarts += 1
+        if worker.up:
+            self._witness.lost()
         heir = next((call.spare for call in worker.calls if call.spare is not None), None) or self._start(-1)
         heir.number = worker.number
         self._workers[worker.number] = heir
+        if heir.up:
+            self._witness.joined()
         for call in worker.calls:
             self._running.pop(call.references[0], None)
             if call.twin:
                 call.worker, call.references, call.began = heir, call.twin, None
                 heir.calls.append(call)
             else:
+                self._witness.again(call)
                 self._queue(call)
             call.spare, call.twin = None, []
         worker.calls = []
@@ -339,6 +356,7 @@ class Pool:
             elif call.began is not None and call.spare is None and now - call.began > self._patience(call):
                 self._rescue(call, now - call.began)
             elif call.spare is not None and not call.twin and call.spare.up:
+                self._witness.again(call)
                 call.twin = self._send(call, call.spare.actor)
 
     def _patience(self, call: Call) -> float:

@@ -15,12 +15,10 @@ from matplotlib import pyplot
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from services.palette import COLOURS, colour_of
+
 __all__ = ["Picture", "colour_of", "drawn", "panels", "style_of"]
 
-COLOURS = (
-    "#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#cc79a7", "#b8a900", "#882255", "#44aa99", "#999999",
-)  # fmt: skip
-"""Told apart by colour-blind eyes (Okabe and Ito 2008, with a darker yellow; the last three are Tol's)."""
 DASHES = ("solid", "dashed", "dotted", "dashdot")
 INK = "#010203"
 """Stands for the page's own colour of text until the SVG is on the page."""
@@ -52,11 +50,6 @@ class Picture(NamedTuple):
     description: str
     """What it shows, for whoever does not see it."""
     svg: str
-
-
-def colour_of(index: int) -> str:
-    """Return the colour of a sub-skill, the same on every page; that of a line, where there are no sub-skills."""
-    return COLOURS[index % len(COLOURS)]
 
 
 def style_of(index: int) -> dict[str, Any]:

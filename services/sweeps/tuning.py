@@ -65,7 +65,7 @@ class Progress(Callback):
         """Say that it is begun again."""
         name = trial.config["trial"]
         self._at.pop(name, None)
-        console.print(f"{name}: its process ended; it is begun again", markup=False)
+        console.print(f"warning: {name}: its process ended; it is begun again", markup=False)
 
     def on_trial_error(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
         """Say that its process ended."""
@@ -84,7 +84,10 @@ class Progress(Callback):
         self._at.pop(name, None)
         result = self._sweep.result(name)
         told = "stopped early, for others are better" if result is None else result.error or result.status
-        console.print(f"{name}: {told}", markup=False)
+        if result is not None and result.status == "failed":
+            console.print(f"{name}: {told}", markup=False)
+        else:
+            console.note(f"{name}: {told}")
         self._bar.advance(1, self._running())
 
     def _running(self) -> str:

@@ -82,6 +82,11 @@ class Tracker:
         """The MLflow run's id, as far as it is known."""
         return self._delivery.run_id
 
+    @property
+    def waiting(self) -> int:
+        """How many records MLflow has not taken yet."""
+        return self._spool.count - self._delivery.delivered
+
     def parameters(self, values: Mapping[str, Any]) -> None:
         """Record settings; MLflow keeps the first value of each, a resumed run's other value becomes a tag."""
         self._spool.append("parameters", {name: str(value) for name, value in values.items()})
@@ -145,7 +150,7 @@ class Tracker:
             if self._troubled():
                 patience = min(patience, FAREWELL_SECONDS)
         self._spool.close()
-        left = self._spool.count - self._delivery.delivered
+        left = self.waiting
         if left:
             self._say(
                 f"{left} of {self._spool.count} MLflow records wait in {self._spool.path}; when MLflow answers again: "
