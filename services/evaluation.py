@@ -60,7 +60,10 @@ class Evaluator:
         return every is not None and 0 < iteration < self.config.training.iterations and iteration % every == 0
 
     def calls(self, checkpoint: Checkpoint) -> list[tuple[Any, ...]]:
-        """Return the arguments of `SimulationWorker.try_out`, and of `imitate`, for each trial; the checkpoint is not read again."""
+        """Return the arguments of `SimulationWorker.try_out`, and of its `imitate`, for each trial.
+
+        The checkpoint is not read again.
+        """
         method = self._method(checkpoint)
         shapes = {name: torch.Size(shape) for name, shape in checkpoint.manifest.shapes.items()}
         parameters = self._runner.share(checkpoint.state.parameters)

@@ -1,6 +1,7 @@
 """Episodes of a policy or an expert in a suite's environments: pure, named by their seeds, no Ray."""
 
 from collections.abc import Sequence
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -215,12 +216,12 @@ def imitation_error(policy: Policy, demonstrations: Sequence[Demonstration]) -> 
         demonstrations: at least one.
     """
     total, memory = 0.0, policy.start(len(demonstrations))
-    alive = np.arange(len(demonstrations))
+    alive = list(demonstrations)
     for step in range(max(map(len, demonstrations))):
-        going_on = np.array([step < len(demonstrations[index]) for index in alive])
-        alive, memory = alive[going_on], memory[going_on]
-        decision = policy.act(np.stack([demonstrations[index].observations[step] for index in alive]), memory)
-        wanted = np.stack([demonstrations[index].actions[step] for index in alive])
+        going_on = [step < len(demonstration) for demonstration in alive]
+        alive, memory = list(compress(alive, going_on)), memory[going_on]
+        decision = policy.act(np.stack([demonstration.observations[step] for demonstration in alive]), memory)
+        wanted = np.stack([demonstration.actions[step] for demonstration in alive])
         total, memory = total + float(np.square(decision.actions - wanted).sum()), decision.memory
     return total / sum(map(len, demonstrations))
 

@@ -135,8 +135,8 @@ def _told(shown: Sequence[_Panel], kept: Thinned, support: int, others: int, per
     few = f", of which the paper draws {OTHERS}; no more are held out" if others < OTHERS else ""
     use = "; ".join(f"{panel.title}: {_shares(panel)}" for panel in shown)
     return (
-        f"{len(kept.states)} states, {thinned} of those in {others} held-out demonstrations{few}; adapted to {support} others; "
-        f"perplexity {perplexity:g}, seed {seed}. {use}."
+        f"{len(kept.states)} states, {thinned} of those in {others} held-out demonstrations{few}; adapted to {support} "
+        f"others; perplexity {perplexity:g}, seed {seed}. {use}."
     )
 
 

@@ -17,12 +17,14 @@ from services.runners import LocalRunner
 
 __all__ = [
     "ADAPTATIONS",
+    "MOST_TASKS",
     "MismatchError",
     "Shots",
     "SideBySide",
     "has_sub_skills",
     "on_tasks",
     "policies",
+    "policy_after",
     "side_by_side",
 ]
 
@@ -121,23 +123,23 @@ def has_sub_skills(run: FinishedRun) -> bool:
     return sub_skills_of(run.config.method) > 1
 
 
-def _adapted(run: FinishedRun, support: Sequence[Demonstration], steps: int | None = None) -> Policy:
-    """Return a run's policy for a support set.
+def policy_after(run: FinishedRun, support: Sequence[Demonstration], steps: int) -> Policy:
+    """Return a run's policy for a support set after some fine-tuning steps.
 
     Args:
         run: whose newest checkpoint is adapted.
         support: demonstrations of one task.
-        steps: of fine-tuning; as in the run's evaluation if they are not given.
+        steps: of fine-tuning.
     """
     settings, evaluation = run.config.method, run.config.evaluation
     method: Standardised[Any] = method_type(settings.name).restored(
         settings, run.experiment.suite.action_dim, run.checkpoint.constants
     )
     parameters = {name: torch.from_numpy(array) for name, array in run.checkpoint.parameters.items()}
-    steps = evaluation.fine_tuning_steps if steps is None else steps
     return method.adapt(parameters, support, FineTuning(steps, evaluation.learning_rate))
 
 
 def policies(run: FinishedRun, support: Sequence[Demonstration]) -> dict[str, Policy]:
-    """Return a run's policies before and after adaptation to a support set."""
-    return dict(zip(ADAPTATIONS, (_adapted(run, support, 0), _adapted(run, support)), strict=True))
+    """Return a run's policies before and after adaptation to a support set, by the fine-tuning of its evaluation."""
+    counts = (0, run.config.evaluation.fine_tuning_steps)
+    return {name: policy_after(run, support, count) for name, count in zip(ADAPTATIONS, counts, strict=True)}

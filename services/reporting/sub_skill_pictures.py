@@ -155,8 +155,9 @@ def draw_transitions(title: str, shown: Sequence[Choices], on: str) -> Picture:
             for (before, after), fraction in np.ndenumerate(np.nan_to_num(followed)):
                 corner = after - 0.5, before - 0.5
                 axis.add_patch(Rectangle(corner, 1, 1, facecolor=colour_of(after), alpha=0.6 * fraction, linewidth=0))
-                if len(followed) <= MOST_CELLS and np.isfinite(followed[before]).all():
-                    axis.text(after, before, f"{fraction:.2f}", ha="center", va="center", fontsize=7.5)
+                if len(followed) <= MOST_CELLS:
+                    told = f"{fraction:.2f}" if np.isfinite(followed[before, after]) else "–"
+                    axis.text(after, before, told, ha="center", va="center", fontsize=7.5)
             ends, numbers = (-0.5, len(followed) - 0.5), range(len(followed))
             axis.set(title=f"{choice.run}, {choice.adaptation}", xlim=ends, ylim=ends[::-1], xticks=numbers)
             axis.set(xlabel="sub-skill at the next step", ylabel="sub-skill", yticks=numbers, aspect="equal")
@@ -165,7 +166,7 @@ def draw_transitions(title: str, shown: Sequence[Choices], on: str) -> Picture:
             f"{choice.run} {choice.adaptation} adaptation: " + (_kept_in_words(followed) or "no step follows another")
             for choice, followed in kept
         )
-        return drawn(figure, title, f"Fractions of each row. Followed by itself, {told}.")
+        return drawn(figure, title, f"Fractions of each row; – where nothing follows. Followed by itself, {told}.")
 
 
 def _kept_in_words(followed: np.ndarray) -> str:

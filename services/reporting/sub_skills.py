@@ -80,6 +80,7 @@ def _transition_table(task: str, shown: Sequence[Choices], kinds: Sequence[str])
         for choice in shown
         for on in kinds
         for before, counts in enumerate(choice.usage(on).transitions)
+        if counts.any()
     ]
     caption = f"{task}: how often a sub-skill is followed by each at the next step"
     return DataTable(caption, ["run", "adaptation", "on", "sub-skill", *(f"then {k}" for k in numbers)], rows)
