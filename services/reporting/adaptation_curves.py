@@ -19,8 +19,8 @@ from services.experiment import Experiment
 from services.progress import Bar, console
 from services.reporting.drawing import Picture, colour_of, drawn, panels
 from services.reporting.finished import FinishedRun, UnfinishedError
+from services.reporting.lineup import MOST_TASKS, MismatchError, policy_after
 from services.reporting.page import DataTable, Part, Prose, Section
-from services.reporting.side_by_side import MOST_TASKS, MismatchError, policy_after
 from services.reporting.sub_skill_pictures import marker_of
 from services.results import EpisodeResult, ImitationResult, read_rows, write_rows
 from services.runners import Runner

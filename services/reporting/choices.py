@@ -11,7 +11,7 @@ from dmil_core.methods.base import Policy
 from dmil_core.seeding import stream_seed
 from dmil_core.settings import sub_skills_of
 from services.reporting.finished import FinishedRun
-from services.reporting.side_by_side import SideBySide, has_sub_skills, policies
+from services.reporting.lineup import Lineup, has_sub_skills, policies
 from services.reporting.usage import Usage, usage
 from services.rollouts import record
 from services.suites.base import Environment, build_env
@@ -43,11 +43,11 @@ class Choices(NamedTuple):
         return usage([timeline.sub_skills for timeline in self.timelines[on]], self.sub_skills)
 
 
-def choices_on(side: SideBySide, task: str, shots: int, rollouts: int) -> list[Choices]:
+def choices_on(lineup: Lineup, task: str, shots: int, rollouts: int) -> list[Choices]:
     """Return what each run that has sub-skills chooses on a task, before and after adaptation.
 
     Args:
-        side: the runs.
+        lineup: the runs.
         task: one of those that are shown.
         shots: demonstrations to adapt to.
         rollouts: episodes to run, those of the run's own evaluation with the same support set.
@@ -55,13 +55,13 @@ def choices_on(side: SideBySide, task: str, shots: int, rollouts: int) -> list[C
     Raises:
         MismatchError: if no demonstration is left to look at.
     """
-    support, others = side.shots(task, shots)
-    suite, found = side.experiment.suite, []
+    support, others = lineup.shots(task, shots)
+    suite, found = lineup.experiment.suite, []
     with ExitStack() as open_envs:
         envs = [build_env(suite, task) for _ in range(rollouts)]
         for env in envs:
             open_envs.callback(env.close)
-        for label, run in side.runs.items():
+        for label, run in lineup.runs.items():
             if not has_sub_skills(run):
                 continue
             for adaptation, policy in policies(run, support).items():

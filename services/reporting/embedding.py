@@ -12,8 +12,8 @@ from dmil_core.demonstrations import Demonstration, Standardisation
 from dmil_core.settings import sub_skills_of
 from services.progress import Bar
 from services.reporting.drawing import Picture, colour_of, drawn, panels
+from services.reporting.lineup import Lineup, has_sub_skills, policies
 from services.reporting.page import Part, Prose, Section
-from services.reporting.side_by_side import SideBySide, has_sub_skills, policies
 from services.reporting.sub_skill_pictures import marker_of
 
 __all__ = ["Thinned", "embed", "embedding_section", "thin_out"]
@@ -68,13 +68,11 @@ def embed(states: Float[np.ndarray, "states obs_dim"], perplexity: float, seed: 
     return tsne.fit_transform(states).astype(np.float32)
 
 
-def embedding_section(
-    side: SideBySide, shots: int = SHOTS, perplexity: float = PERPLEXITY, seed: int = SEED
-) -> Section:
+def embedding_section(lineup: Lineup, shots: int = SHOTS, perplexity: float = PERPLEXITY, seed: int = SEED) -> Section:
     """Return a section with a picture for each task, of all runs whose methods have sub-skills.
 
     Args:
-        side: the runs and tasks.
+        lineup: the runs and tasks.
         shots: demonstrations to adapt to.
         perplexity: of t-SNE; a third of the states where there are few.
         seed: of t-SNE.
@@ -83,7 +81,7 @@ def embedding_section(
         MismatchError: if no demonstration is left to look at.
     """
     title = "t-SNE of states by sub-skill"
-    if not any(map(has_sub_skills, side.runs.values())):
+    if not any(map(has_sub_skills, lineup.runs.values())):
         return Section(title, [])
     parts: list[Part] = [
         Prose(
@@ -93,16 +91,16 @@ def embedding_section(
             "and their sizes mean nothing. The paper reads fewer, connected regions as more meaningful sub-skills."
         )
     ]
-    with Bar("embedding states", len(side.held_out)) as bar:
-        for task in side.held_out:
-            parts.append(_draw(side, task, shots, perplexity, seed))
+    with Bar("embedding states", len(lineup.held_out)) as bar:
+        for task in lineup.held_out:
+            parts.append(_draw(lineup, task, shots, perplexity, seed))
             bar.advance(1, task)
     return Section(title, parts)
 
 
-def _draw(side: SideBySide, task: str, shots: int, perplexity: float, seed: int) -> Picture:
-    support, others = side.shots(task, shots, OTHERS)
-    runs = {label: run for label, run in side.runs.items() if has_sub_skills(run)}
+def _draw(lineup: Lineup, task: str, shots: int, perplexity: float, seed: int) -> Picture:
+    support, others = lineup.shots(task, shots, OTHERS)
+    runs = {label: run for label, run in lineup.runs.items() if has_sub_skills(run)}
     kept = thin_out(others, min(MOST_STATES, MOST_POINTS // (2 * len(runs))))
     perplexity = min(perplexity, max(1.0, (len(kept.states) - 1) / 3))
     places = embed(Standardisation.of(others)(kept.states), perplexity, seed)

@@ -1,4 +1,4 @@
-"""Write a page on what both levels of runs do on some tasks, side by side: the paper's Figure 4.
+"""Write a page on the sub-skills that runs take in some tasks, side by side: the paper's Figure 4.
 
 For example, with the variants of a sweep: python -m services.report sub-skills DMIL=trained/DIGEST OptionGAIL=NAME
 --tasks hand-insert push-around-wall. The tasks may be any of the runs' kind of robot, also such as no run has; the
@@ -19,8 +19,8 @@ from services.progress import console
 from services.reporting.embedding import PERPLEXITY, SEED, embedding_section
 from services.reporting.embedding import SHOTS as EMBEDDING_SHOTS
 from services.reporting.finished import FinishedRun
+from services.reporting.lineup import Lineup, has_sub_skills, line_up
 from services.reporting.page import DataTable, Prose, write_page
-from services.reporting.side_by_side import SideBySide, has_sub_skills, side_by_side
 from services.reporting.sub_skills import sub_skill_sections
 
 __all__ = ["Arguments", "run"]
@@ -59,14 +59,14 @@ def run(arguments: Sequence[str]) -> None:
     given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
     _check(given)
     torch.set_num_threads(1)
-    side = side_by_side(_found(given.which, given.runs), given.tasks)
-    sections = sub_skill_sections(side, given.shots, given.rollouts)
-    sections.append(embedding_section(side, given.embedding_shots, given.perplexity, given.seed))
+    lineup = line_up(_found(given.which, given.runs), given.tasks)
+    sections = sub_skill_sections(lineup, given.shots, given.rollouts)
+    sections.append(embedding_section(lineup, given.embedding_shots, given.perplexity, given.seed))
     lead = [
         Prose("Which sub-skill the high level takes, and where, before adaptation to a task and after it."),
-        _runs_table(side),
+        _runs_table(lineup),
     ]
-    write_page(given.output, f"Sub-skills on {', '.join(side.held_out)}", lead, sections)
+    write_page(given.output, f"Sub-skills on {', '.join(lineup.held_out)}", lead, sections)
     console.print(str(given.output), markup=False)
 
 
@@ -102,9 +102,9 @@ def _found(which: Sequence[str], runs: Path) -> dict[str, FinishedRun]:
     return found
 
 
-def _runs_table(side: SideBySide) -> DataTable:
+def _runs_table(lineup: Lineup) -> DataTable:
     rows = []
-    for label, own in side.runs.items():
+    for label, own in lineup.runs.items():
         evaluation, checkpoint = own.config.evaluation, own.checkpoint
         rows.append(
             [

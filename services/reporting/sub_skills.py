@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 from services.progress import Bar
 from services.reporting.choices import DEMONSTRATIONS, ROLLOUTS, Choices, choices_on
+from services.reporting.lineup import Lineup, has_sub_skills
 from services.reporting.page import DataTable, Part, Prose, Section
-from services.reporting.side_by_side import SideBySide, has_sub_skills
 from services.reporting.sub_skill_pictures import draw_timelines, draw_transitions, draw_usage
 
 __all__ = ["sub_skill_sections"]
@@ -15,23 +15,25 @@ DRAWN = 3
 """So many demonstrations are drawn; the statistics are of all."""
 
 
-def sub_skill_sections(side: SideBySide, shots: int = 1, rollouts: int = 3) -> list[Section]:
+def sub_skill_sections(lineup: Lineup, shots: int = 1, rollouts: int = 3) -> list[Section]:
     """Return a section for each task, with all runs whose methods have sub-skills; none if there is no such run.
 
     Args:
-        side: the runs and tasks.
+        lineup: the runs and tasks.
         shots: demonstrations to adapt to; one, as in the paper.
         rollouts: episodes to run for each run, before adaptation and after.
 
     Raises:
         MismatchError: if no demonstration is left to look at.
     """
-    if not any(map(has_sub_skills, side.runs.values())):
+    if not any(map(has_sub_skills, lineup.runs.values())):
         return []
     found = []
-    with Bar("looking at sub-skills", len(side.held_out)) as bar:
-        for task in side.held_out:
-            found.append(Section(f"Sub-skills on {task}", _parts(task, shots, choices_on(side, task, shots, rollouts))))
+    with Bar("looking at sub-skills", len(lineup.held_out)) as bar:
+        for task in lineup.held_out:
+            found.append(
+                Section(f"Sub-skills on {task}", _parts(task, shots, choices_on(lineup, task, shots, rollouts)))
+            )
             bar.advance(1, task)
     return found
 

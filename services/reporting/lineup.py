@@ -18,14 +18,14 @@ from services.runners import LocalRunner
 __all__ = [
     "ADAPTATIONS",
     "MOST_TASKS",
+    "Lineup",
     "MismatchError",
     "Shots",
-    "SideBySide",
     "has_sub_skills",
+    "line_up",
     "on_tasks",
     "policies",
     "policy_after",
-    "side_by_side",
 ]
 
 MOST_TASKS = 4
@@ -48,7 +48,7 @@ class Shots(NamedTuple):
 
 
 @dataclass(frozen=True)
-class SideBySide:
+class Lineup:
     """Runs by their labels, and what they are looked at on."""
 
     runs: Mapping[str, FinishedRun]
@@ -72,7 +72,7 @@ class SideBySide:
         return Shots(held_out[:count], held_out[count:][:others])
 
 
-def side_by_side(runs: Mapping[str, FinishedRun], tasks: Sequence[str] | None = None) -> SideBySide:
+def line_up(runs: Mapping[str, FinishedRun], tasks: Sequence[str] | None = None) -> Lineup:
     """Put runs side by side on some tasks.
 
     Args:
@@ -94,7 +94,7 @@ def side_by_side(runs: Mapping[str, FinishedRun], tasks: Sequence[str] | None = 
         experiment = on_tasks(run, wanted)
         data = experiment.collect(LocalRunner(experiment.suite))
     held_out = experiment.held_out_sets(data)
-    return SideBySide(runs, experiment, {task: held_out[task] for task in wanted})
+    return Lineup(runs, experiment, {task: held_out[task] for task in wanted})
 
 
 def on_tasks(run: FinishedRun, tasks: Sequence[str]) -> Experiment:
