@@ -1,11 +1,12 @@
 """Success and loss over fine-tuning steps, for several sizes of the support set: measured once, kept, and drawn."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullLocator
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dmil_core.configs import EvaluationConfig
@@ -33,6 +34,8 @@ PARTS = (0.0, 0.1, 0.3, 1.0, 2.0)
 """The fine-tuning steps that are measured, in parts of those of the run's evaluation."""
 EPISODES, DRAWS = 10, 2
 """Of each task, for each number of shots and steps; and the support sets that these are spread over."""
+APART = 0.08
+"""How far lines stand from each other, where a number of steps takes 1."""
 MOST_BYTES = 2**20
 
 
@@ -245,35 +248,38 @@ def adaptation_section(run: FinishedRun) -> Section:
 
 
 def _draw(found: Sequence[Point]) -> Picture:
+    """Draw a line for each number of shots, at places side by side for each number of steps."""
     sizes = list(dict.fromkeys(point.shots for point in found))
     steps = sorted({point.steps for point in found})
     with panels(1, 3, width=10.0, height=3.4) as (figure, axes):
         success, held_out, support = axes
         for place, size in enumerate(sizes):
             own = [point for point in found if point.shots == size]
-            _draw_line(success, place, own, lambda point: point.rate.rate)
-            low, high = [point.rate.low for point in own], [point.rate.high for point in own]
-            success.fill_between([p.steps for p in own], low, high, color=colour_of(place), alpha=0.12, linewidth=0)
-            _draw_line(held_out, place, own, lambda point: point.held_out_error)
-            _draw_line(support, place, own, lambda point: point.support_error)
-        success.set(title="success", ylabel="success rate", ylim=(0, 1.02))
-        held_out.set(title="loss on held-out demonstrations", ylabel="squared error of actions", yscale="log")
-        support.set(title="loss on the support set", ylabel="squared error of actions", yscale="log")
+            at = np.array([steps.index(point.steps) for point in own]) + APART * (place - (len(sizes) - 1) / 2)
+            style = {"color": colour_of(place), "marker": marker_of(place), "markersize": 4, "label": f"{size}-shot"}
+            rates = np.array([[rate.rate, rate.low, rate.high] for rate in (point.rate for point in own)]).T
+            reach = np.abs(rates[1:] - rates[0])
+            success.errorbar(at, rates[0], yerr=reach, elinewidth=0.8, capsize=2, **style)
+            held_out.plot(at, [_or_nan(point.held_out_error) for point in own], **style)
+            support.plot(at, [_or_nan(point.support_error) for point in own], **style)
+        success.set(title="success", ylabel="success rate", ylim=(-0.02, 1.02))
+        for axis, title in ((held_out, "loss on held-out demonstrations"), (support, "loss on the support set")):
+            axis.set(title=title, ylabel="squared error of actions", yscale="log")
+            axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.yaxis.set_major_formatter("{x:g}")
+            axis.yaxis.set_minor_locator(NullLocator())
         for axis in axes:
-            axis.set_xscale("symlog", linthresh=max(1, min((count for count in steps if count), default=1)))
-            axis.set_xticks(steps, map(str, steps))
-            axis.minorticks_off()
-            axis.set(xlabel="fine-tuning steps", xlim=(0, max(*steps, 1)))
-        handles = success.get_legend_handles_labels()
-        figure.legend(*handles, loc="outside lower center", ncols=len(sizes), frameon=False)
+            axis.set_xticks(range(len(steps)), map(str, steps))
+            axis.set_xlabel("fine-tuning steps, not to scale")
+        handles = [Line2D([], [], color=colour_of(place), marker=marker_of(place)) for place in range(len(sizes))]
+        names = [f"{size}-shot" for size in sizes]
+        figure.legend(handles, names, loc="outside lower center", ncols=len(sizes), frameon=False)
         told = "; ".join(f"{size}-shot {_course(found, size)}" for size in sizes)
-        return drawn(figure, "Success and loss over fine-tuning steps", f"Bands are 95% Wilson intervals. {told}.")
+        return drawn(figure, "Success and loss over fine-tuning steps", f"Bars are 95% Wilson intervals. {told}.")
 
 
-def _draw_line(axis: Axes, place: int, own: Sequence[Point], of: Callable[[Point], float | None]) -> None:
-    heights = [np.nan if (value := of(point)) is None else value for point in own]
-    style = {"color": colour_of(place), "marker": marker_of(place), "markersize": 4, "clip_on": False}
-    axis.plot([point.steps for point in own], heights, label=f"{own[0].shots}-shot", **style)
+def _or_nan(error: float | None) -> float:
+    return np.nan if error is None else error
 
 
 def _course(found: Sequence[Point], shots: int) -> str:
