@@ -23,7 +23,6 @@ __all__ = [
     "Shots",
     "has_sub_skills",
     "line_up",
-    "on_tasks",
     "policies",
     "policy_after",
 ]
@@ -91,13 +90,13 @@ def line_up(runs: Mapping[str, FinishedRun], tasks: Sequence[str] | None = None)
     if set(wanted) <= {task for _, task in run.experiment.tasks}:
         experiment, data = run.experiment, run.demonstrations
     else:
-        experiment = on_tasks(run, wanted)
+        experiment = _on_tasks(run, wanted)
         data = experiment.collect(LocalRunner(experiment.suite))
     held_out = experiment.held_out_sets(data)
     return Lineup(runs, experiment, {task: held_out[task] for task in wanted})
 
 
-def on_tasks(run: FinishedRun, tasks: Sequence[str]) -> Experiment:
+def _on_tasks(run: FinishedRun, tasks: Sequence[str]) -> Experiment:
     """Return a run's experiment with other meta-testing tasks, as `services.evaluate` has it."""
     suite = run.config.suite.model_copy(update={"test_tasks": tuple(tasks)})
     return Experiment(run.config.model_copy(update={"suite": suite}), run.experiment.store)
