@@ -19,8 +19,8 @@ from services.failures import keeping_failures
 from services.metrics import EPISODES, SUCCESS_RATE, SUCCESSES, Meter
 from services.progress import console
 from services.provenance import library_versions
-from services.results import AdaptationResult, EpisodeResult, Split, write_rows
-from services.rollouts import Trial, TrialOutcome, trials
+from services.results import AdaptationResult, EpisodeResult, ImitationResult, Split, write_rows
+from services.rollouts import Imitation, Trial, TrialOutcome, trials
 from services.runners import Runner, Simulation
 from services.screen import Tally
 from services.suites.base import TaskSuite
@@ -90,7 +90,10 @@ class Evaluator:
         return every is not None and 0 < iteration < self.config.training.iterations and iteration % every == 0
 
     def calls(self, checkpoint: Checkpoint) -> list[tuple[Any, ...]]:
-        """Return the arguments of `SimulationWorker.try_out` for each trial; the checkpoint is not read again."""
+        """Return the arguments of `SimulationWorker.try_out`, and of its `imitate`, for each trial.
+
+        The checkpoint is not read again.
+        """
         method = self._method(checkpoint)
         shapes = {name: torch.Size(shape) for name, shape in checkpoint.manifest.shapes.items()}
         parameters = self._runner.share(checkpoint.state.parameters)
@@ -102,24 +105,45 @@ class Evaluator:
 
     def evaluation(self, checkpoint: Checkpoint, outcomes: Iterable[TrialOutcome]) -> Evaluation:
         """Return a row for each episode and each adaptation, from the outcomes of the trials in their order."""
-        settings = self.config.evaluation
-        common = {"suite": self._suite.name, "protocol": self._suite.protocol, "method": self.config.method.name}
-        common |= {"checkpoint": checkpoint.digest, "versions": library_versions()}
-        common |= {"fine_tuning_steps": settings.fine_tuning_steps, "learning_rate": settings.learning_rate}
         episodes, adaptations = [], []
         for trial, outcome in zip(self.trials, outcomes, strict=True):
-            row = common | {
-                "split": trial.split,
-                "task": trial.task,
-                "shots": trial.shots,
-                "draw": trial.draw,
-                "support": [demonstration.id for demonstration in trial.support(self._held_out[trial.task])],
-                "data": self._data[trial.task].digest,
-            }
+            row = self._row(checkpoint, trial)
             episodes += _episode_rows(row, trial, outcome)
             adaptations.append(_adaptation_row(row, outcome, sub_skills_of(self.config.method)))
         failed = {task: dataset.failed for task, dataset in self._data.items()}
         return Evaluation(checkpoint, self._suite.protocol, self._suite.best_score, failed, episodes, adaptations)
+
+    def imitation(self, checkpoint: Checkpoint, outcomes: Iterable[Imitation]) -> list[ImitationResult]:
+        """Return a row for each trial, from what `SimulationWorker.imitate` found in them in their order."""
+        return [
+            ImitationResult.model_validate(
+                {
+                    **self._row(checkpoint, trial),
+                    "support_error": _finite(outcome.support),
+                    "held_out_error": _finite(outcome.held_out),
+                }
+            )
+            for trial, outcome in zip(self.trials, outcomes, strict=True)
+        ]
+
+    def _row(self, checkpoint: Checkpoint, trial: Trial) -> dict[str, object]:
+        """Return what names a trial in all of its rows."""
+        settings = self.config.evaluation
+        return {
+            "suite": self._suite.name,
+            "protocol": self._suite.protocol,
+            "method": self.config.method.name,
+            "checkpoint": checkpoint.digest,
+            "versions": library_versions(),
+            "fine_tuning_steps": settings.fine_tuning_steps,
+            "learning_rate": settings.learning_rate,
+            "split": trial.split,
+            "task": trial.task,
+            "shots": trial.shots,
+            "draw": trial.draw,
+            "support": [demonstration.id for demonstration in trial.support(self._held_out[trial.task])],
+            "data": self._data[trial.task].digest,
+        }
 
     def _method(self, checkpoint: Checkpoint) -> Standardised[Any]:
         settings = self.config.method
@@ -217,6 +241,10 @@ def write_evaluation(evaluation: Evaluation, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     write_rows(folder / "adaptations.jsonl", evaluation.adaptations)
     write_rows(folder / "episodes.jsonl", evaluation.episodes)
+
+
+def _finite(error: float | None) -> float | None:
+    return error if error is not None and np.isfinite(error) else None
 
 
 def _episode_rows(row: Mapping[str, object], trial: Trial, outcome: TrialOutcome) -> list[EpisodeResult]:

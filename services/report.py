@@ -34,6 +34,7 @@ PANELS: Mapping[str, tuple[str, ...]] = {
 KINDS = {
     "compare": "services.reporting.comparison",
     "gallery": "services.gallery",
+    "sub-skills": "services.reporting.sub_skill_report",
     "tables": "services.sweeps.layout",
 }
 """What the program draws, and the module that does."""

@@ -9,7 +9,16 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from dmil_core.errors import UserError, explain
 from services.disk import read_file, write_file
 
-__all__ = ["AdaptationResult", "EpisodeResult", "RowError", "Split", "read_lines", "read_rows", "write_rows"]
+__all__ = [
+    "AdaptationResult",
+    "EpisodeResult",
+    "ImitationResult",
+    "RowError",
+    "Split",
+    "read_lines",
+    "read_rows",
+    "write_rows",
+]
 
 Split = Literal["meta-training", "meta-testing"]
 Row = TypeVar("Row", bound=BaseModel)
@@ -69,6 +78,18 @@ class AdaptationResult(_Row):
     """Of these, where the high level takes the sub-skill that fits the demonstrated action best."""
     sub_skill_steps: tuple[int, ...]
     """Of these, how many each sub-skill takes."""
+
+
+class ImitationResult(_Row):
+    """How far an adapted policy's actions are from those demonstrated: mean ‖π(s) − a‖² over steps.
+
+    A policy that has diverged has no error.
+    """
+
+    support_error: float | None
+    """On the demonstrations that it was adapted to."""
+    held_out_error: float | None
+    """On held-out ones that it was not adapted to, where there are any."""
 
 
 def write_rows(path: Path, rows: Iterable[BaseModel]) -> None:

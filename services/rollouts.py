@@ -1,6 +1,7 @@
 """Episodes of a policy or an expert in a suite's environments: pure, named by their seeds, no Ray."""
 
 from collections.abc import Sequence
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -16,11 +17,15 @@ from services.suites.base import Attempt, Environment, Expert
 
 __all__ = [
     "Episode",
+    "Imitation",
     "Trial",
     "TrialOutcome",
     "demonstrate",
     "episodes_beside",
+    "imitate",
+    "imitation_error",
     "practise",
+    "record",
     "rollout",
     "trials",
     "try_out",
@@ -119,16 +124,25 @@ def practise(policy: Policy, envs: Sequence[Environment], seed: int, steps: int,
     while steps > 0:
         numbers = range(len(rollouts), len(rollouts) + episodes_beside(steps, horizon))
         seeds = [stream_seed(seed, "episode", number) for number in numbers]
-        found = _recorded(policy, envs, seeds, min(horizon, steps), horizon)
+        found = record(policy, envs, seeds, min(horizon, steps), horizon)
         steps -= sum(len(rollout.actions) for rollout in found)
         rollouts += found
     return rollouts
 
 
-def _recorded(
-    policy: Policy, envs: Sequence[Environment], seeds: Sequence[int], most: int, horizon: int
-) -> list[Rollout]:
-    """Record an episode for each seed, of at most so many steps."""
+def record(policy: Policy, envs: Sequence[Environment], seeds: Sequence[int], most: int, horizon: int) -> list[Rollout]:
+    """Record an episode for each seed, of at most so many steps; it is that of `rollout`, step by step.
+
+    Args:
+        policy: what acts.
+        envs: of one task, at least one for each seed.
+        seeds: of the episodes.
+        most: steps that are recorded.
+        horizon: steps in an episode.
+
+    Raises:
+        FloatingPointError: for an action that is not finite.
+    """
     first = [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=False)]
     observations = [[observation.astype(np.float32)] for observation in first]
     actions: list[list[np.ndarray]] = [[] for _ in seeds]
@@ -192,6 +206,26 @@ def _clip(actions: np.ndarray, env: Environment) -> np.ndarray:
     return np.clip(actions, space.low, space.high)
 
 
+def imitation_error(policy: Policy, demonstrations: Sequence[Demonstration]) -> float:
+    """Return ‖π(s) − a‖² averaged over all steps: how far a policy is from what was demonstrated, in its states.
+
+    What the policy remembers between steps is its own; the states are the demonstrations', whatever it does.
+
+    Args:
+        policy: adapted.
+        demonstrations: at least one.
+    """
+    total, memory = 0.0, policy.start(len(demonstrations))
+    alive = list(demonstrations)
+    for step in range(max(map(len, demonstrations))):
+        going_on = [step < len(demonstration) for demonstration in alive]
+        alive, memory = list(compress(alive, going_on)), memory[going_on]
+        decision = policy.act(np.stack([demonstration.observations[step] for demonstration in alive]), memory)
+        wanted = np.stack([demonstration.actions[step] for demonstration in alive])
+        total, memory = total + float(np.square(decision.actions - wanted).sum()), decision.memory
+    return total / sum(map(len, demonstrations))
+
+
 def trials(tasks: Sequence[tuple[Split, str]], evaluation: EvaluationConfig) -> list[Trial]:
     """Return all adaptations of an evaluation, a task's episodes spread over its support sets."""
     return [
@@ -238,3 +272,26 @@ def try_out(
     others = [demonstration for demonstration in held_out if demonstration not in support]
     episodes = rollout(policy, envs[: len(seeds)], seeds, horizon)
     return TrialOutcome(episodes, [policy.sub_skill_use(demonstration) for demonstration in others])
+
+
+class Imitation(NamedTuple):
+    """The `imitation_error` of an adapted policy."""
+
+    support: float
+    """On what it was adapted to."""
+    held_out: float | None
+    """On the held-out demonstrations of the task that it was not adapted to, where there are any."""
+
+
+def imitate(
+    method: Method,
+    parameters: Parameters,
+    trial: Trial,
+    held_out: Sequence[Demonstration],
+    evaluation: EvaluationConfig,
+) -> Imitation:
+    """Adapt to a trial's support set, and compare the policy with demonstrations: no episodes, else as `try_out`."""
+    support = trial.support(held_out)
+    policy = method.adapt(parameters, support, FineTuning(evaluation.fine_tuning_steps, evaluation.learning_rate))
+    others = [demonstration for demonstration in held_out if demonstration not in support]
+    return Imitation(imitation_error(policy, support), imitation_error(policy, others) if others else None)

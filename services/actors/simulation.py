@@ -13,7 +13,16 @@ from dmil_core.errors import piece_of_work
 from dmil_core.methods.base import Method, Policy, Rollout
 from dmil_core.networks import unflatten
 from dmil_core.seeding import stream_seed
-from services.rollouts import Trial, TrialOutcome, demonstrate, episodes_beside, practise, try_out
+from services.rollouts import (
+    Imitation,
+    Trial,
+    TrialOutcome,
+    demonstrate,
+    episodes_beside,
+    imitate,
+    practise,
+    try_out,
+)
 from services.suites.base import Attempt, Environment, TaskSuite, build_env
 from services.verification import VerificationRow, verify
 
@@ -91,6 +100,24 @@ class SimulationWorker:
             envs = self._environments(trial.task, len(trial.episodes))
             own = unflatten(torch.tensor(parameters), shapes)
             return try_out(method, own, trial, held_out, envs, self._suite.horizon, evaluation, seed)
+
+    def imitate(
+        self,
+        method: Method,
+        parameters: Float32[np.ndarray, " size"],
+        shapes: Mapping[str, torch.Size],
+        trial: Trial,
+        held_out: Sequence[Demonstration],
+        evaluation: EvaluationConfig,
+        seed: int,
+    ) -> Imitation:
+        """Adapt as in one trial, and compare the policy with demonstrations; the arguments are those of `try_out`.
+
+        Raises:
+            WorkError: for a Python error in it.
+        """
+        with piece_of_work(f"{trial.in_words}, seed {seed}", **trial.piece):
+            return imitate(method, unflatten(torch.tensor(parameters), shapes), trial, held_out, evaluation)
 
 
 def piece_of_call(method: str, arguments: Sequence[Any]) -> tuple[str, dict[str, str | int]]:

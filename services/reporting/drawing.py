@@ -89,6 +89,9 @@ def drawn(figure: Figure, title: str, description: str) -> Picture:
     figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     svg = text.getvalue()
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
+    svg = re.sub(
+        r'\b[dxy]="[^"]*"', lambda places: re.sub(r"(\.\d\d)\d+", r"\1", places[0]), svg
+    )  # it is then half as long
     own = f"p{next(_numbers)}-"
     svg = re.sub(r'(\bid="|xlink:href="#|url\(#)', rf"\g<1>{own}", svg).replace(INK, "currentColor")
     head = f'role="img" aria-labelledby="{own}title {own}description"'

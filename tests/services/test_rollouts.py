@@ -7,8 +7,8 @@ import pytest
 
 from dmil_core.configs import DemonstrationConfig, EvaluationConfig, SuiteConfig
 from dmil_core.demonstrations import Demonstration
-from dmil_core.methods.base import Decision, SubSkillUse
-from services.rollouts import demonstrate, rollout, trials
+from dmil_core.methods.base import Decision, Flat, SubSkillUse
+from services.rollouts import demonstrate, imitation_error, record, rollout, trials
 from services.suites.base import Environment, Expert
 from services.suites.metaworld import MetaWorldSuite
 
@@ -169,3 +169,34 @@ def test_episodes_are_spread_evenly_over_disjoint_support_sets(episodes: int, dr
             assert min(sizes) >= max(1, max(sizes) - 1)
             support = [demonstration.id for trial in of_one for demonstration in trial.support(held_out)]
             assert len(support) == len(set(support)) == shots * len(of_one)
+
+
+class Remembering(Flat):
+    """Does in each step as many units as it has taken steps."""
+
+    def start(self, episodes: int) -> np.ndarray:
+        return np.zeros((episodes, 1), np.int64)
+
+    def act(self, observations: np.ndarray, memory: np.ndarray) -> Decision:
+        return Decision(memory.astype(np.float32), np.zeros(len(memory), np.int64), memory + 1)
+
+
+def demonstration(*actions: float) -> Demonstration:
+    return Demonstration("0", "task", np.zeros((len(actions), 2), np.float32), np.array(actions, np.float32)[:, None])
+
+
+def test_the_error_is_of_each_step_with_the_memory_of_its_own_episode():
+    policy = Remembering()
+    assert imitation_error(policy, [demonstration(0, 1, 2, 3)]) == 0
+    assert imitation_error(policy, [demonstration(1), demonstration(0, 1, 4)]) == (1 + 0 + 0 + 4) / 4
+
+
+def test_a_recorded_episode_is_the_one_that_is_counted(suite, make_envs):
+    envs, seeds = make_envs("reach", 2), [5, 6]
+    counted = rollout(ExpertPolicy(suite.expert("reach")), envs, seeds, HORIZON)
+    policy = ExpertPolicy(suite.expert("reach"))
+    recorded = record(policy, envs, seeds, HORIZON, HORIZON)
+    for number, (episode, found) in enumerate(zip(counted, recorded, strict=True)):
+        assert (found.success, len(found.actions)) == (episode.success, episode.steps)
+        assert np.bincount(found.sub_skills).tolist() == episode.sub_skill_steps
+        assert np.array_equal(found.observations[:-1], policy.episode(number))

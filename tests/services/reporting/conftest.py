@@ -1,5 +1,6 @@
 import shutil
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,18 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, sync_playwright
 
+from dmil_core.configs import preset_of
+from services.checkpoints import Checkpoints
+from services.command_line import checked
+from services.demo_store import DemoStore, data_root
+from services.experiment import Experiment
+from services.reporting.finished import FinishedRun
+from services.runners import LocalRunner
+from services.settings_files import merged
+from services.tracking import Tracker
+
 CHROMIUM = shutil.which("chromium")
+EXAMPLE = Path(__file__).parents[3] / "docs" / "examples" / "planar_visits" / "planar_visits.py"
 
 
 @dataclass
@@ -78,3 +90,50 @@ def open_page(browser: Browser):
 
     yield open_page
     context.close()
+
+
+@pytest.fixture(scope="session")
+def planar_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the demonstrations of planar visits are kept, so that each is made once."""
+    return tmp_path_factory.mktemp("planar-data")
+
+
+@pytest.fixture
+def planar_visits(tmp_path: Path, planar_data: Path, mlflow_file: str, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A suite whose episodes take no time, the example of the guide, as an installed package; an empty workplace."""
+    package = tmp_path / "packages"
+    information = package / "planar_visits-0.1.0.dist-info"
+    information.mkdir(parents=True)
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: planar-visits\nVersion: 0.1.0\n")
+    (information / "entry_points.txt").write_text("[dmil.suites]\nplanar-visits = planar_visits:PlanarVisits\n")
+    shutil.copy(EXAMPLE, package)
+    monkeypatch.syspath_prepend(package)
+    monkeypatch.delitem(sys.modules, "planar_visits", raising=False)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DMIL_DATA", str(planar_data))
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", mlflow_file)
+    return tmp_path
+
+
+@pytest.fixture
+def trained(planar_visits: Path) -> Callable[..., FinishedRun]:
+    """Meta-trains a little on planar visits, and returns what is left: a checkpoint, without an evaluation."""
+
+    def train(name: str, of: str = "dmil", **settings: Any) -> FinishedRun:
+        config = preset_of("planar-visits", "smoke", of)
+        given: dict[str, Any] = {"demonstrations": {"per_task": 14, "held_out": 8}}
+        if config.training.iterations:
+            given["training"] = {"iterations": 4, "checkpoint_every": 4}
+        config = checked(merged(config.model_dump(), given | settings, "test"))
+        experiment = Experiment(config, DemoStore(data_root()))
+        runner = LocalRunner(experiment.suite)
+        folder = planar_visits / "runs" / name
+        folder.mkdir(parents=True)
+        (folder / "config.json").write_text(config.model_dump_json())
+        data = experiment.collect(runner)
+        tracker = Tracker(folder, "test", print)
+        experiment.train(runner, data, Checkpoints(folder / "checkpoints", 1), tracker)
+        tracker.close("FINISHED")
+        return FinishedRun(folder)
+
+    return train

@@ -1,0 +1,144 @@
+"""Several runs of one kind of robot on the same tasks, and their policies before and after adaptation."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+
+from dmil_core.demonstrations import Demonstration
+from dmil_core.errors import UserError
+from dmil_core.methods.base import FineTuning, Policy, Standardised
+from dmil_core.methods.registry import method_type
+from dmil_core.settings import sub_skills_of
+from services.experiment import Experiment
+from services.reporting.finished import FinishedRun
+from services.runners import LocalRunner
+
+__all__ = [
+    "ADAPTATIONS",
+    "MOST_TASKS",
+    "Lineup",
+    "MismatchError",
+    "Shots",
+    "has_sub_skills",
+    "line_up",
+    "policies",
+    "policy_after",
+]
+
+MOST_TASKS = 4
+"""So many of a run's meta-testing tasks are shown, unless tasks are named."""
+ADAPTATIONS = ("before", "after")
+"""Before adaptation a policy has taken no fine-tuning step on the support set."""
+
+
+class MismatchError(UserError):
+    """Runs that cannot be shown side by side."""
+
+
+class Shots(NamedTuple):
+    """A task's held-out demonstrations, as they are used."""
+
+    support: Sequence[Demonstration]
+    """Those that are adapted to."""
+    others: Sequence[Demonstration]
+    """Those that are looked at."""
+
+
+@dataclass(frozen=True)
+class Lineup:
+    """Runs by their labels, and what they are looked at on."""
+
+    runs: Mapping[str, FinishedRun]
+    experiment: Experiment
+    """The first run's, on the tasks that are shown."""
+    held_out: Mapping[str, Sequence[Demonstration]]
+    """Of each task that is shown, the demonstrations that meta-training has not seen."""
+
+    def shots(self, task: str, count: int, others: int | None = None) -> Shots:
+        """Return the first support set of a task, and the demonstrations after it, at most so many.
+
+        Raises:
+            MismatchError: if no demonstration is left to look at.
+        """
+        held_out = self.held_out[task]
+        if len(held_out) <= count:
+            raise MismatchError(
+                f"--shots: got {count}; wanted fewer than the {len(held_out)} held-out demonstrations of {task}, so "
+                "that some are left to look at"
+            )
+        return Shots(held_out[:count], held_out[count:][:others])
+
+
+def line_up(runs: Mapping[str, FinishedRun], tasks: Sequence[str] | None = None) -> Lineup:
+    """Put runs side by side on some tasks.
+
+    Args:
+        runs: at least one, by its label.
+        tasks: of their kind of robot, the runs' own or others; the first run's meta-testing tasks, at most
+            `MOST_TASKS`, if none are named.
+
+    Raises:
+        MismatchError: if the runs are of different robots, or their demonstrations made or held out otherwise.
+        UserError: for a task that there is not.
+    """
+    (first, run), *others = runs.items()
+    for label, other in others:
+        _check_alike(first, run, label, other)
+    wanted = tuple(dict.fromkeys(tasks or run.experiment.suite.test_tasks[:MOST_TASKS]))
+    if set(wanted) <= {task for _, task in run.experiment.tasks}:
+        experiment, data = run.experiment, run.demonstrations
+    else:
+        experiment = _on_tasks(run, wanted)
+        data = experiment.collect(LocalRunner(experiment.suite))
+    held_out = experiment.held_out_sets(data)
+    return Lineup(runs, experiment, {task: held_out[task] for task in wanted})
+
+
+def _on_tasks(run: FinishedRun, tasks: Sequence[str]) -> Experiment:
+    """Return a run's experiment with other meta-testing tasks, as `services.evaluate` has it."""
+    suite = run.config.suite.model_copy(update={"test_tasks": tuple(tasks)})
+    return Experiment(run.config.model_copy(update={"suite": suite}), run.experiment.store)
+
+
+def _check_alike(first: str, run: FinishedRun, label: str, other: FinishedRun) -> None:
+    settings = [
+        {
+            "robot": each.experiment.suite.family,
+            "protocol": each.experiment.suite.protocol,
+            **each.config.demonstrations.model_dump(),
+        }
+        for each in (run, other)
+    ]
+    if differing := [field for field in settings[0] if settings[0][field] != settings[1][field]]:
+        got = ", ".join(f"{field} {settings[1][field]!r}" for field in differing)
+        wanted = ", ".join(repr(settings[0][field]) for field in differing)
+        raise MismatchError(f"{label}: got {got}; wanted {wanted}, as {first} has; show them on pages of their own")
+
+
+def has_sub_skills(run: FinishedRun) -> bool:
+    """Tell whether the high level of a run's method has a choice."""
+    return sub_skills_of(run.config.method) > 1
+
+
+def policy_after(run: FinishedRun, support: Sequence[Demonstration], steps: int) -> Policy:
+    """Return a run's policy for a support set after some fine-tuning steps.
+
+    Args:
+        run: whose newest checkpoint is adapted.
+        support: demonstrations of one task.
+        steps: of fine-tuning.
+    """
+    settings, evaluation = run.config.method, run.config.evaluation
+    method: Standardised[Any] = method_type(settings.name).restored(
+        settings, run.experiment.suite.action_dim, run.checkpoint.constants
+    )
+    parameters = {name: torch.from_numpy(array) for name, array in run.checkpoint.parameters.items()}
+    return method.adapt(parameters, support, FineTuning(steps, evaluation.learning_rate))
+
+
+def policies(run: FinishedRun, support: Sequence[Demonstration]) -> dict[str, Policy]:
+    """Return a run's policies before and after adaptation to a support set, by the fine-tuning of its evaluation."""
+    counts = (0, run.config.evaluation.fine_tuning_steps)
+    return {name: policy_after(run, support, count) for name, count in zip(ADAPTATIONS, counts, strict=True)}

@@ -1,0 +1,127 @@
+"""Write a page on the sub-skills that runs take in some tasks, side by side: the paper's Figure 4.
+
+For example, with the variants of a sweep: python -m services.report sub-skills DMIL=trained/DIGEST OptionGAIL=NAME
+--tasks hand-insert push-around-wall. The tasks may be any of the runs' kind of robot, also such as no run has; the
+experts demonstrate those that there are no demonstrations of.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import tyro
+
+from services.command_line import ConfigError, exit_code, parse
+from services.folders import find_folder
+from services.progress import console
+from services.reporting.embedding import PERPLEXITY, SEED, embedding_section
+from services.reporting.embedding import SHOTS as EMBEDDING_SHOTS
+from services.reporting.finished import FinishedRun
+from services.reporting.lineup import Lineup, has_sub_skills, line_up
+from services.reporting.page import DataTable, Prose, write_page
+from services.reporting.sub_skills import sub_skill_sections
+
+__all__ = ["Arguments", "run"]
+
+MARK = "config.json"
+"""What the folder of a run, or of a configuration that a sweep has trained, is known by."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Arguments of ``report sub-skills``."""
+
+    which: tyro.conf.Positional[tuple[str, ...]]
+    """Runs, by name or folder, or what sweeps have trained, as trained/DIGEST; LABEL=RUN has the page call it so."""
+    tasks: tuple[str, ...] | None = None
+    """Tasks to look at; they need not be the runs', only of their kind of robot. If not given, the first run's
+    meta-testing tasks, at most 4."""
+    shots: int = 1
+    """Demonstrations to adapt to for timelines and statistics; one, as in Figure 4b."""
+    rollouts: int = 3
+    """Episodes to run for each run and task, before adaptation and after."""
+    embedding_shots: int = EMBEDDING_SHOTS
+    """Demonstrations to adapt to for the t-SNE; three, as in Figure 4a."""
+    perplexity: float = PERPLEXITY
+    """Of the t-SNE."""
+    seed: int = SEED
+    """Of the t-SNE."""
+    output: Path = Path("sub-skills.html")
+    """File to write."""
+    runs: Path = Path("runs")
+    """The folder that runs' own folders are in."""
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run the program."""
+    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
+    _check(given)
+    torch.set_num_threads(1)
+    lineup = line_up(_found(given.which, given.runs), given.tasks)
+    sections = sub_skill_sections(lineup, given.shots, given.rollouts)
+    sections.append(embedding_section(lineup, given.embedding_shots, given.perplexity, given.seed))
+    lead = [
+        Prose("Which sub-skill the high level takes, and where, before adaptation to a task and after it."),
+        _runs_table(lineup),
+    ]
+    write_page(given.output, f"Sub-skills on {', '.join(lineup.held_out)}", lead, sections)
+    console.print(str(given.output), markup=False)
+
+
+def _check(given: Arguments) -> None:
+    """Refuse numbers that nothing can be made of.
+
+    Raises:
+        ConfigError: names the flag.
+    """
+    least = {"shots": 1, "rollouts": 0, "embedding_shots": 1, "perplexity": 1, "seed": 0}
+    for name, bound in least.items():
+        if not (got := getattr(given, name)) >= bound:
+            raise ConfigError(f"--{name.replace('_', '-')}: got {got}; wanted at least {bound}")
+
+
+def _found(which: Sequence[str], runs: Path) -> dict[str, FinishedRun]:
+    """Return the runs by their labels.
+
+    Raises:
+        ConfigError: for none at all, or two of one label.
+        FolderError: if there is no such run.
+    """
+    found: dict[str, FinishedRun] = {}
+    for named in which:
+        label, _, name = named.rpartition("=")
+        own = FinishedRun(find_folder(name, runs, MARK, "RUN"))
+        if (label := label or own.name) in found:
+            raise ConfigError(f"RUN: got {label} twice; wanted each once, or labels to tell them apart: LABEL=RUN")
+        found[label] = own
+    if not any(map(has_sub_skills, found.values())):
+        got = ", ".join(f"{label} of {own.config.method.name}" for label, own in found.items()) or "none"
+        raise ConfigError(f"RUN: got {got}; wanted at least one of a method with several sub-skills, as dmil")
+    return found
+
+
+def _runs_table(lineup: Lineup) -> DataTable:
+    rows = []
+    for label, own in lineup.runs.items():
+        evaluation, checkpoint = own.config.evaluation, own.checkpoint
+        rows.append(
+            [
+                label,
+                own.config.method.name,
+                getattr(own.config.method, "sub_skills", "none"),
+                own.config.suite.name,
+                own.config.seed,
+                checkpoint.manifest.iteration,
+                evaluation.fine_tuning_steps,
+                f"{evaluation.learning_rate:g}",
+                checkpoint.digest[:12],
+            ]
+        )
+    head = ["run", "method", "sub-skills", "suite", "seed", "iterations", "fine-tuning steps", "learning rate"]
+    return DataTable("The runs", [*head, "checkpoint"], rows)
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(run, sys.argv[1:]))
