@@ -96,7 +96,7 @@ def postgres(network: Network, wait_for: Callable[..., None]) -> Iterator[str]:
     """The address of a database; Postgres does not run as root."""
     folder = Path(tempfile.mkdtemp(prefix="dmil-pg"))
     shutil.chown(folder, "postgres")
-    as_postgres = {"user": "postgres"} if os.geteuid() == 0 else {}
+    as_postgres: dict[str, Any] = {"user": "postgres"} if os.geteuid() == 0 else {}
     made = subprocess.run(
         [POSTGRES / "initdb", "-D", folder / "data", "-U", "mlflow", "--auth=trust"],
         capture_output=True, text=True, **as_postgres,

@@ -1,7 +1,6 @@
 """Sweeps as a user runs them: real Tune, real MLflow, real deaths."""
 
 import json
-import os
 import signal
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -16,7 +15,7 @@ from mlflow.entities import Run
 from dmil_core.configs import ExperimentConfig
 from services import tune_sweep
 from services.checkpoints import Checkpoint, Checkpoints
-from services.demo_store import TaskDemonstrations
+from services.demo_store import TaskDemonstrations, open_store
 from services.experiment import Experiment, open_runner
 from services.sweeps.folders import SweepFolder
 from services.tracking import Tracker
@@ -187,7 +186,7 @@ def newest(home: Path) -> Checkpoint:
 def undisturbed(config: ExperimentConfig, data: dict[str, TaskDemonstrations], folder: Path) -> np.ndarray:
     """Return the parameters that the configuration has when it is trained in this process."""
     folder.mkdir(parents=True)
-    experiment = Experiment(config, tune_sweep.DemoStore(Path(os.environ["DMIL_DATA"])))
+    experiment = Experiment(config, open_store())
     tracker = Tracker(folder, "alone", print)
     with open_runner("local", experiment.suite, None) as runner:
         checkpoint = experiment.train(runner, data, Checkpoints(folder / "checkpoints", 1), tracker)
