@@ -15,7 +15,7 @@ from matplotlib import pyplot
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-__all__ = ["Picture", "colour_of", "drawn", "panels", "style_of"]
+__all__ = ["DASHES", "INK", "Picture", "colour_of", "drawn", "panels", "style_of"]
 
 COLOURS = (
     "#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#cc79a7", "#b8a900", "#882255", "#44aa99", "#999999",
@@ -34,6 +34,9 @@ STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
+    "axes.axisbelow": True,
+    "figure.constrained_layout.h_pad": 0.09,
+    "figure.constrained_layout.w_pad": 0.09,
     "grid.alpha": 0.2,
     "font.size": 9.0,
     "axes.titlesize": 10.0,
