@@ -97,8 +97,8 @@ WORDS = {
     "sub_skill_entropy": "entropy of the shares (1: all alike)",
     "agreement": "agreement with the best-fitting sub-skill",
     "switches": "switches, of all steps",
-    "discriminator_expert": "expert taken for the expert",
-    "discriminator_pseudo": "policy taken for the expert",
+    "discriminator_expert": "D of the expert's actions",
+    "discriminator_pseudo": "D of the policy's actions",
 }
 """What a metric's line is called, if not by its name."""
 

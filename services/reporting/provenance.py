@@ -9,6 +9,8 @@ from services.reporting.settings import flags, nearest_preset
 
 __all__ = ["episodes_of_run", "origin_of_run"]
 
+DIGITS = 16
+"""Of a data set's digest."""
 MOST_ROWS = 6000
 """Of episodes in a page, some 2 MB."""
 
@@ -47,19 +49,17 @@ def _training(finished: FinishedRun) -> str:
 
 
 def _data_sets(finished: FinishedRun) -> DataTable:
-    summary = finished.summary
-    ids = {digest: name for name, digest in finished.origin.data_sets.items()}
+    summary, ids = finished.summary, {digest: name for name, digest in finished.origin.data_sets.items()}
     rows = [
         [
-            task,
-            ids.get(digest, ""),
-            summary.demonstrations.get(task, ""),
-            summary.failed_attempts.get(task, ""),
-            digest,
+            *(task, ids.get(digest, "")),
+            *(found.get(task, "") for found in (summary.demonstrations, summary.failed_attempts)),
+            digest[:DIGITS],
         ]
         for task, digest in finished.checkpoint.manifest.data.items()
     ]
-    return DataTable("Demonstrations", ["task", "data set", "demonstrations", "failed attempts", "SHA-256"], rows)
+    head = ["task", "data set", "demonstrations", "failed attempts", f"SHA-256, first {DIGITS} digits"]
+    return DataTable("Demonstrations", head, rows)
 
 
 def episodes_of_run(finished: FinishedRun) -> Section:

@@ -149,4 +149,5 @@ def _in_words(by_shots: Mapping[int, Mapping[str, Estimate]], tasks: Sequence[st
         best, worst = tasks[-1], tasks[0]
         ends = f", from {worst} with {own[worst].mean:.2f} to {best} with {own[best].mean:.2f}" if len(own) > 1 else ""
         told.append(f"{shots}-shot {mean:.2f} on average (dashed){ends}")
-    return f"Bars are a task's {what}, whiskers its 95% interval; the order is that of the mean over all shots: {'; '.join(told)}."
+    what_it_is = f"Bars are a task's {what}, whiskers its 95% interval; the order is that of the mean over all shots"
+    return f"{what_it_is}: {'; '.join(told)}."
