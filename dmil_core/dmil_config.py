@@ -12,6 +12,7 @@ class DmilConfig(HierarchicalConfig):
     """Dual Meta Imitation Learning."""
 
     name: Literal["dmil"] = "dmil"
+    """The method."""
     hidden_layers: Size = 4
     """Layers of ReLU units in each network (F.2)."""
     hidden_units: Size = 512

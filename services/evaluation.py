@@ -111,7 +111,9 @@ class Evaluator:
             episodes += _episode_rows(row, trial, outcome)
             adaptations.append(_adaptation_row(row, outcome, sub_skills_of(self.config.method)))
         failed = {task: dataset.failed for task, dataset in self._data.items()}
-        return Evaluation(checkpoint, self._suite.protocol, self._suite.best_score, failed, episodes, adaptations)
+        held = {task: len(dataset.demonstrations) for task, dataset in self._data.items()}
+        suite = self._suite
+        return Evaluation(checkpoint, suite.protocol, suite.best_score, failed, held, episodes, adaptations)
 
     def imitation(self, checkpoint: Checkpoint, outcomes: Iterable[Imitation]) -> list[ImitationResult]:
         """Return a row for each trial, from what `SimulationWorker.imitate` found in them in their order."""

@@ -25,7 +25,9 @@ from services.experiment import Experiment, OnNonfinite, RunnerKind, open_runner
 from services.folders import find_folder, new_folder
 from services.progress import Clock, console
 from services.replica import replicated, restored
-from services.report import publish, show, write_report
+from services.report import PAGE, publish, show, write_report
+from services.reporting.finished import FinishedRun
+from services.reporting.run_report import write_run_page
 from services.storage import STORAGE
 from services.summary import summarise
 from services.tracking import Tracker, introduce
@@ -112,6 +114,7 @@ def _carry_out(given: Arguments, folder: Path, checkpoint: Checkpoint | None) ->
             clock.lap("evaluate")
         summary = summarise(evaluation, seconds=clock.seconds, folder=folder, mlflow_run_id=tracker.run_id)
         write_report(summary, folder)
+        write_run_page(FinishedRun(folder), folder / "report" / PAGE)
         publish(tracker, summary, folder)
         status = "FINISHED"
     except KeyboardInterrupt:

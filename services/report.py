@@ -1,91 +1,39 @@
-"""What a run shows at its end: the table on the terminal, and its report folder with tables and plots.
+"""What a run shows at its end, on the terminal and as tables; its page is `reporting.run_report`'s.
 
 As a program it draws what there is to look at: ``python -m services.report gallery``.
 """
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
-
-import matplotlib
-
-matplotlib.use("Agg")
-from matplotlib import pyplot
-from matplotlib.axes import Axes
 
 from services.checkpoints import Checkpoint
 from services.command_line import ConfigError, exit_code
 from services.progress import console
-from services.summary import AGAINST_COLLAPSE, COLLAPSED, Summary, rates, table, table_markdown, write_summary
+from services.summary import AGAINST_COLLAPSE, Summary, rates, table, table_markdown, write_summary
 from services.tracking import Tracker, redacted
-from services.tracking.spool import Measured, read_spool
 
-__all__ = ["draw_curves", "publish", "read_metrics", "run", "show", "write_report"]
+__all__ = ["PAGE", "publish", "run", "show", "write_report"]
 
-PANELS: Mapping[str, tuple[str, ...]] = {
-    "high-level loss": ("high_loss_before", "high_loss_after"),
-    "sub-skill loss": ("low_loss_before", "low_loss_after"),
-    "continuity loss": ("continuity_loss",),
-    "share of states": ("sub_skill_share/",),
-    "agreement and usage entropy": ("agreement", "sub_skill_entropy"),
-    "gradient norm": ("gradient_norm",),
-}
+PAGE = "report.html"
+"""In a run's report folder."""
 KINDS = {
+    "run": "services.reporting.run_report",
     "compare": "services.reporting.comparison",
-    "gallery": "services.gallery",
     "sub-skills": "services.reporting.sub_skill_report",
+    "gallery": "services.gallery",
     "tables": "services.sweeps.layout",
 }
 """What the program draws, and the module that does."""
-SMOOTHED = 50
-"""A curve is drawn through so many means at most."""
-
-
-def read_metrics(folder: Path) -> list[dict[str, float]]:
-    """Return the metrics of each iteration from a run's ``tracking.jsonl``; an iteration done again counts once.
-
-    Raises:
-        SpoolError: names the line that is damaged.
-    """
-    by_step: dict[int, dict[str, float]] = {}
-    for line in read_spool(folder / "tracking.jsonl"):
-        if isinstance(line.value, Measured):
-            by_step.setdefault(line.value.step, {"iteration": line.value.step}).update(line.value.values)
-    return [by_step[step] for step in sorted(by_step)]
-
-
-def draw_curves(metrics: list[dict[str, float]], path: Path) -> None:
-    """Draw losses, sub-skill usage and gradient norms over the iterations."""
-    figure, axes = pyplot.subplots(2, 3, figsize=(13, 6.5), layout="constrained")
-    for axis, (title, prefixes) in zip(axes.flat, PANELS.items(), strict=True):
-        _draw_panel(axis, title, prefixes, metrics)
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
-
-
-def _draw_panel(axis: Axes, title: str, prefixes: tuple[str, ...], metrics: list[dict[str, float]]) -> None:
-    for name in dict.fromkeys(name for row in metrics for name in row if name.startswith(prefixes)):
-        rows = [row for row in metrics if name in row]
-        size = -(-len(rows) // SMOOTHED)
-        parts = [rows[first : first + size] for first in range(0, len(rows), size)]
-        means = [sum(row[name] for row in part) / len(part) for part in parts]
-        axis.plot([part[-1]["iteration"] for part in parts], means, label=name.replace("_", " "))
-    axis.set(title=title, xlabel="iteration")
-    if "share" not in title and "agreement" not in title:
-        axis.set_yscale("symlog", linthresh=0.01)
-    if axis.lines:
-        axis.legend(fontsize="small")
 
 
 def write_report(summary: Summary, folder: Path) -> None:
-    """Write ``summary.json``, and the folder ``report`` with the tables and the curves."""
+    """Write ``summary.json``, and the folder ``report`` with the tables."""
     write_summary(summary, folder / "summary.json")
     report = folder / "report"
     report.mkdir(exist_ok=True)
     (report / "table.md").write_text(table_markdown(summary))
-    if metrics := read_metrics(folder):
-        draw_curves(metrics, report / "curves.png")
 
 
 def publish(tracker: Tracker, summary: Summary, folder: Path) -> None:
@@ -112,14 +60,15 @@ def show(summary: Summary, tracking_uri: str | None = None) -> None:
             f"{split}: sub-skills take {shares} of the states; {use.in_use_per_task:.1f} in use per task; "
             f"the high level agrees with the best-fitting sub-skill on {use.agreement:.2f}"
         )
-    if any(len(use.share) > 1 and max(use.share) > COLLAPSED for use in summary.sub_skills.values()):
+    if summary.collapsed:
         console.print(
             f"warning: one sub-skill takes nearly all states, so the hierarchy is not used; {AGAINST_COLLAPSE}"
         )
     if failed := {task: count for task, count in summary.failed_attempts.items() if count}:
         console.print("failed expert attempts: " + ", ".join(f"{task} {count}" for task, count in failed.items()))
     console.print("seconds: " + ", ".join(f"{phase} {spent:.0f}" for phase, spent in summary.seconds.items()))
-    console.print(f"checkpoint: {summary.checkpoint}\nreport: {summary.report}")
+    page = Path(summary.report) / PAGE
+    console.print(f"checkpoint: {summary.checkpoint}\nreport: {page if page.exists() else summary.report}")
     if tracking_uri is not None:
         console.print(f"MLflow run: {summary.mlflow_run_id or 'not there yet'} at {redacted(tracking_uri)}")
         if tracking_uri.startswith("sqlite"):

@@ -25,6 +25,8 @@ __all__ = [
     "SubSkillUse",
     "Summary",
     "cells",
+    "described",
+    "headline",
     "rates",
     "sub_skill_use",
     "summarise",
@@ -51,6 +53,8 @@ class Evaluation(NamedTuple):
     best_score: int
     """Of an episode in which all is done, see `TaskSuite`."""
     failed_attempts: dict[str, int]
+    demonstrations: dict[str, int]
+    """Of each task."""
     episodes: list[EpisodeResult]
     adaptations: list[AdaptationResult]
 
@@ -117,6 +121,13 @@ class Summary(BaseModel):
     mlflow_run_id: str | None
     failed_attempts: dict[str, int]
     """Attempts of each task's expert that were no success and so no demonstration."""
+    demonstrations: dict[str, int] = {}
+    """Of each task, those held out among them; none is told in older files."""
+
+    @property
+    def collapsed(self) -> bool:
+        """Whether one of several sub-skills takes nearly all states."""
+        return any(len(use.share) > 1 and max(use.share) > COLLAPSED for use in self.sub_skills.values())
 
 
 def cells(episodes: Sequence[EpisodeResult], best_score: int, method: MethodConfig) -> list[Cell]:
@@ -220,13 +231,14 @@ def summarise(
         report=str(folder / "report"),
         mlflow_run_id=mlflow_run_id,
         failed_attempts=evaluation.failed_attempts,
+        demonstrations=evaluation.demonstrations,
     )
 
 
 def table(summary: Summary) -> Table:
     """Lay the summary out for the terminal."""
-    head, *rows = _table(summary)
-    view = Table(title=f"Success rates of {_described(summary)}")
+    head, *rows = headline(summary)
+    view = Table(title=f"Success rates of {described(summary)}")
     for column in head:
         named = column in ("suite", "split")
         view.add_column(column, justify="left" if named else "right", no_wrap=named)
@@ -237,22 +249,23 @@ def table(summary: Summary) -> Table:
 
 def table_markdown(summary: Summary) -> str:
     """Lay the summary out as Markdown, with the success rate, and the score if there is one, of each task below."""
-    head, *rows = _table(summary)
+    head, *rows = headline(summary)
     lines = [_row(head), _row(["---"] * len(head)), *map(_row, rows)]
     for split in dict.fromkeys(cell.split for cell in summary.rows):
         cells = [cell for cell in summary.rows if cell.split == split]
         lines += ["", _row(["task", *(f"{cell.shots}-shot" for cell in cells)]), _row(["---"] * (len(cells) + 1))]
         lines += [_row([task, *(_of_task(cell, task) for cell in cells)]) for task in sorted(cells[0].per_task)]
-    return f"Success rates of {_described(summary)}.\n\n" + "\n".join(lines) + "\n"
+    return f"Success rates of {described(summary)}.\n\n" + "\n".join(lines) + "\n"
 
 
-def _described(summary: Summary) -> str:
+def described(summary: Summary) -> str:
+    """Return of what a summary is: the method, the protocol, the seed, and its steps in environments."""
     steps = f"; {summary.environment_steps:,} environment steps in meta-training" if summary.environment_steps else ""
     return f"{summary.method} ({summary.protocol}; seed {summary.seed}{steps})"
 
 
-def _table(summary: Summary) -> list[list[str]]:
-    """Return head and rows; columns that no row has anything in are left out."""
+def headline(summary: Summary) -> list[list[str]]:
+    """Return the head and the rows of the table; columns that no row has anything in are left out."""
     columns = ["suite", "split", "shots", "successes", "success rate", "95% interval"]
     rows = [_fields(cell) for cell in summary.rows]
     best = max((cell.score.best for cell in summary.rows if cell.score), default=1)

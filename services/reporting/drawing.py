@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from services.palette import COLOURS, colour_of
 
-__all__ = ["Picture", "colour_of", "drawn", "panels", "style_of"]
+__all__ = ["DASHES", "INK", "Picture", "colour_of", "drawn", "panels", "style_of"]
 
 DASHES = ("solid", "dashed", "dotted", "dashdot")
 INK = "#010203"
@@ -32,6 +32,9 @@ STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
+    "axes.axisbelow": True,
+    "figure.constrained_layout.h_pad": 0.09,
+    "figure.constrained_layout.w_pad": 0.09,
     "grid.alpha": 0.2,
     "font.size": 9.0,
     "axes.titlesize": 10.0,

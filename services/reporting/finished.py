@@ -12,22 +12,22 @@ from services.checkpoints import Checkpoint, Checkpoints
 from services.demo_store import TaskDemonstrations, open_store
 from services.disk import read_file
 from services.experiment import Experiment
-from services.folders import find_folder
-from services.report import read_metrics
+from services.folders import FolderError, find_folder
+from services.reporting.records import Origin, read_metrics, read_origin
 from services.results import AdaptationResult, EpisodeResult, read_rows
 from services.runners import LocalRunner
 from services.summary import Summary
 
 __all__ = ["FinishedRun", "UnfinishedError"]
 
-MARK = "summary.json"
-"""What a finished run's folder is known by."""
+MARK, BEGUN, CHECKPOINTS = "summary.json", "config.json", "checkpoints"
+"""What the folder of a finished run is known by, what that of any run, and what no evaluation's has."""
 MOST_BYTES = 2**24
 """In it."""
 
 
 class UnfinishedError(UserError):
-    """A run of which there is not all that is to be shown."""
+    """A run that has not come to its end, or of which there is not all that is to be shown."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,25 @@ class FinishedRun:
         """Return a run by its name in `runs`, or by its folder.
 
         Raises:
-            FolderError: if there is no folder of a finished run.
+            FolderError: if there is no folder of a run.
+            UnfinishedError: if the run has not come to its end, or the folder is only that of an evaluation.
         """
-        return FinishedRun(find_folder(name, runs, MARK, "RUN"))
+        try:
+            folder = find_folder(name, runs, MARK, "RUN")
+        except FolderError as error:
+            for begun in (Path(name), runs / name):
+                if (begun / BEGUN).is_file():
+                    raise UnfinishedError(
+                        f"RUN: got {begun}, which has not come to its end; wanted a finished run, with a {MARK}; go on "
+                        f"with it: python -m services.meta_train --resume {begun}"
+                    ) from error
+            raise
+        if not (folder / CHECKPOINTS).is_dir():
+            raise UnfinishedError(
+                f"RUN: got {folder}, which has no {CHECKPOINTS}, as the folder of an evaluation; wanted that of a run "
+                "of services.meta_train"
+            )
+        return FinishedRun(folder)
 
     @property
     def name(self) -> str:
@@ -73,7 +89,7 @@ class FinishedRun:
         Raises:
             CheckpointError: if there is none, or it is damaged.
         """
-        return Checkpoints(self.folder / "checkpoints", kept=0).newest()
+        return Checkpoints(self.folder / CHECKPOINTS, kept=0).newest()
 
     @cached_property
     def config(self) -> ExperimentConfig:
@@ -94,6 +110,31 @@ class FinishedRun:
     def metrics(self) -> list[dict[str, float]]:
         """Those of each iteration, under ``iteration`` its number."""
         return read_metrics(self.folder)
+
+    @cached_property
+    def origin(self) -> Origin:
+        """What it was made of."""
+        return read_origin(self.folder)
+
+    @cached_property
+    def evaluations(self) -> dict[int, list[EpisodeResult]]:
+        """The rows of each evaluation by its iteration: those on the way, and the one of the last checkpoint."""
+        found = {
+            int(path.parent.name): read_rows(path, EpisodeResult)
+            for path in sorted((self.folder / "evaluations").glob("*/episodes.jsonl"))
+            if path.parent.name.isdecimal()
+        }
+        return found if self.has_gone_on else found | {self.checkpoint.manifest.iteration: self.episodes}
+
+    @property
+    def best_score(self) -> int:
+        """Of an episode in which all is done; 1 in suites without scores."""
+        return max((cell.score.best for cell in self.summary.rows if cell.score), default=1)
+
+    @property
+    def has_gone_on(self) -> bool:
+        """Whether it was trained on since its end, so that the last checkpoint is another than that evaluated."""
+        return self.checkpoint.digest != self.summary.checkpoint_digest
 
     @cached_property
     def experiment(self) -> Experiment:

@@ -20,7 +20,7 @@ from services.disk import read_file, write_file
 from services.experiment import Experiment
 from services.progress import Clock, console
 from services.ray_runner import RayRunner
-from services.report import read_metrics
+from services.reporting.records import read_metrics
 from services.results import EpisodeResult, read_rows
 from services.summary import cells, rates
 from services.sweeps.folders import SweepFolder, TrialResult, evaluated, trained

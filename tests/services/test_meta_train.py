@@ -54,12 +54,15 @@ def test_a_run_from_end_to_end(programs, workplace: Path, data, mlflow_file: str
     for row in summary["rows"]:
         successes = f"{round(row['success_rate'] * row['episodes'])}/{row['episodes']}"
         assert any(row["split"] in line and successes in line for line in printed.splitlines())
-    for place in ("checkpoint: runs/whole/checkpoints/iteration-0000020", "report: runs/whole/report"):
+    for place in ("checkpoint: runs/whole/checkpoints/iteration-0000020", "report: runs/whole/report/report.html"):
         assert place in printed
     assert f"MLflow run: {summary['mlflow_run_id']} at {mlflow_file}" in printed
     assert "mlflow ui --backend-store-uri" in printed
     assert "meta-training 20/20" in printed
-    assert (folder / "report" / "curves.png").read_bytes().startswith(b"\x89PNG")
+    page = (folder / "report" / "report.html").read_text()
+    assert all(
+        f">{title}</h2>" in page for title in ("Success of each task", "Training curves", "Settings", "Episodes")
+    )
     assert "drawer-close" in (folder / "report" / "table.md").read_text()
 
     checkpoint = Checkpoint(folder / "checkpoints" / "iteration-0000020")
@@ -97,7 +100,7 @@ def test_a_run_from_end_to_end(programs, workplace: Path, data, mlflow_file: str
     folders = (None, "report", "checkpoint")
     artifacts = {entry.path for path in folders for entry in client.list_artifacts(run.info.run_id, path)}
     assert artifacts >= {
-        "summary.json", "episodes.jsonl", "report/table.md", "report/curves.png", "checkpoint/manifest.json",
+        "summary.json", "episodes.jsonl", "report/table.md", "report/report.html", "checkpoint/manifest.json",
         "checkpoint/parameters.safetensors", "checkpoint/optimiser.safetensors",
     }  # fmt: skip
 

@@ -11,7 +11,7 @@ from mutations import Odd, json_bytes, mutated_bytes, mutated_value
 
 from dmil_core.configs import PRESETS, ExperimentConfig
 from services.command_line import config_from
-from services.report import read_metrics
+from services.reporting.records import read_metrics
 from services.results import AdaptationResult, EpisodeResult, read_rows, write_rows
 
 

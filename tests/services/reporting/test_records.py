@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from services.report import draw_curves, read_metrics
+from services.reporting.records import Origin, read_metrics, read_origin
 from services.tracking.spool import SpoolError
 
 
@@ -47,8 +47,14 @@ def test_a_folder_without_records_has_no_metrics(tmp_path: Path) -> None:
     assert read_metrics(tmp_path) == []
 
 
-def test_curves_are_drawn_from_however_few_iterations(tmp_path: Path) -> None:
-    names = ("high_loss_before", "high_loss_after", "low_loss_before", "low_loss_after", "continuity_loss")
-    names += ("agreement", "sub_skill_entropy", "gradient_norm", "sub_skill_share/0", "sub_skill_share/1")
-    draw_curves([{"iteration": 1, **dict.fromkeys(names, 0.5)}], tmp_path / "curves.png")
-    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+def test_what_a_run_was_made_of_is_read_from_its_records(tmp_path: Path) -> None:
+    assert read_origin(tmp_path) == Origin((), {})
+    spool(
+        tmp_path,
+        ("tags", {"git_commit": "a", "suite": "ml10"}),
+        ("inputs", {"metaworld/reach/x": "1"}),
+        ("tags", {"git_commit": "b-dirty"}),
+        ("inputs", {"metaworld/reach/x": "1", "metaworld/push/x": "2"}),
+        ("tags", {"git_commit": "a"}),
+    )
+    assert read_origin(tmp_path) == Origin(("a", "b-dirty"), {"metaworld/reach/x": "1", "metaworld/push/x": "2"})

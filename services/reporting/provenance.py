@@ -1,0 +1,84 @@
+"""Where a run's figures come from: demonstrations, versions, time; and how to have them again, to the episode."""
+
+import shlex
+
+from dmil_core.configs import DEFAULT_METHOD
+from services.reporting.finished import FinishedRun
+from services.reporting.page import Commands, DataTable, Part, Prose, Section
+from services.reporting.settings import flags, nearest_preset
+
+__all__ = ["episodes_of_run", "origin_of_run"]
+
+DIGITS = 16
+"""Of a data set's digest."""
+MOST_ROWS = 6000
+"""Of episodes in a page, some 2 MB."""
+
+
+def origin_of_run(finished: FinishedRun) -> Section:
+    """Return the section with commands, demonstrations, the commit, versions and seconds."""
+    manifest, commits = finished.checkpoint.manifest, ", then ".join(finished.origin.commits)
+    checkpoint, folder = shlex.quote(str(finished.checkpoint.path)), shlex.quote(str(finished.folder))
+    parts: list[Part] = [
+        Commands("To train and evaluate it again", [_training(finished)]),
+        Commands(
+            "To evaluate its last checkpoint again, and to write this page again",
+            [
+                f"python -m services.evaluate --checkpoint {checkpoint} --output evaluation",
+                f"python -m services.report run {folder}",
+            ],
+        ),
+        Prose(
+            f"Commit of the code: {commits or 'unknown'}. Digest of the checkpoint: "
+            f"{finished.summary.checkpoint_digest}. Equal settings, data and versions give equal bits on the same kind "
+            "of processor, with any number of workers."
+        ),
+        _data_sets(finished),
+        DataTable("Versions", ["library", "version"], list(manifest.versions.items())),
+        DataTable("Time", ["phase", "seconds"], list(finished.summary.seconds.items())),
+    ]
+    return Section("Where it comes from", parts)
+
+
+def _training(finished: FinishedRun) -> str:
+    config, nearest = finished.config, nearest_preset(finished.config)
+    method = config.method.name
+    named = "" if method == DEFAULT_METHOD else f" --method {method}"
+    command = f"python -m services.meta_train --suite {config.suite.name} --preset {nearest.size}{named}"
+    return f"{command} {flags(nearest.differing)}".rstrip()
+
+
+def _data_sets(finished: FinishedRun) -> DataTable:
+    summary, ids = finished.summary, {digest: name for name, digest in finished.origin.data_sets.items()}
+    rows = [
+        [
+            *(task, ids.get(digest, "")),
+            *(found.get(task, "") for found in (summary.demonstrations, summary.failed_attempts)),
+            digest[:DIGITS],
+        ]
+        for task, digest in finished.checkpoint.manifest.data.items()
+    ]
+    head = ["task", "data set", "demonstrations", "failed attempts", f"SHA-256, first {DIGITS} digits"]
+    return DataTable("Demonstrations", head, rows)
+
+
+def episodes_of_run(finished: FinishedRun) -> Section:
+    """Return the section with a row for each episode, and how to see one."""
+    rows, scored = finished.episodes, finished.best_score > 1
+    folder = shlex.quote(str(finished.folder))
+    head = ["task", "split", "shots", "episode", "draw", "support", "success", "steps", "seed"]
+    fields = [
+        [
+            *(row.task, row.split, row.shots, row.episode, row.draw, " ".join(row.support)),
+            *("yes" if row.success else "no", row.steps, row.seed),
+            *([row.score] if scored else []),
+        ]
+        for row in rows[:MOST_ROWS]
+    ]
+    pattern = f"python -m services.report video {folder} --task TASK --shots SHOTS --episode EPISODE"
+    parts: list[Part] = [Commands("To see one", [pattern])]
+    if len(rows) > MOST_ROWS:
+        path = finished.folder / "episodes.jsonl"
+        parts.append(Prose(f"The first {MOST_ROWS:,} of {len(rows):,} episodes; all are in {path}."))
+    caption = "Each episode; a draw is which of the support sets was adapted to, the seed is the environment's"
+    return Section("Episodes", [*parts, DataTable(caption, head + (["score"] if scored else []), fields)])

@@ -1,0 +1,153 @@
+"""How often a run's adapted policies succeed: the table, and the bars of each task."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from dmil_core.statistics import mean_score, success_rate
+from services.reporting.drawing import INK, Picture, colour_of, drawn, panels
+from services.reporting.finished import FinishedRun
+from services.reporting.page import DataTable, Part, Prose, Section
+from services.results import EpisodeResult, Split
+from services.summary import AGAINST_COLLAPSE, described, headline
+
+__all__ = ["Estimate", "estimates", "rates_of_tasks", "table_of_all"]
+
+ABREAST = 4
+"""Panels side by side at most."""
+INCHES_A_TASK = 0.22
+
+
+class Estimate(NamedTuple):
+    """A mean over episodes with its 95% interval, which a single score has not."""
+
+    mean: float
+    low: float | None
+    high: float | None
+    counted: str
+    """What it is the mean of, in a few characters."""
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """How far the interval goes below and above the mean."""
+        low, high = (self.mean if side is None else side for side in (self.low, self.high))
+        return max(0.0, self.mean - low), max(0.0, high - self.mean)
+
+
+def estimates(episodes: Sequence[EpisodeResult], *, scores: bool) -> dict[tuple[Split, int, str], Estimate]:
+    """Return the success rate, with Wilson's interval, by split, shots and task.
+
+    Args:
+        episodes: all rows.
+        scores: return the mean score, with Student's interval, instead.
+    """
+    groups: dict[tuple[Split, int, str], list[EpisodeResult]] = defaultdict(list)
+    for row in episodes:
+        groups[row.split, row.shots, row.task].append(row)
+    return {key: _score(rows) if scores else _rate(rows) for key, rows in groups.items()}
+
+
+def _rate(rows: Sequence[EpisodeResult]) -> Estimate:
+    rate = success_rate([row.success for row in rows])
+    return Estimate(rate.rate, rate.low, rate.high, f"{rate.successes}/{rate.episodes}")
+
+
+def _score(rows: Sequence[EpisodeResult]) -> Estimate:
+    mean = mean_score([float(row.score) for row in rows])
+    return Estimate(mean.mean, mean.low, mean.high, f"of {mean.episodes}")
+
+
+def table_of_all(finished: FinishedRun) -> list[Part]:
+    """Return the lead of a run's page: what it is, its success rates beside the paper's, and what to beware of."""
+    summary = finished.summary
+    head, *rows = headline(summary)
+    parts: list[Part] = [Prose(f"Success rates of {described(summary)}.")]
+    if summary.collapsed:
+        parts.append(
+            Prose(
+                "Warning: one sub-skill takes nearly all states, so the hierarchy is not used, whatever the success "
+                f"rates; {AGAINST_COLLAPSE}."
+            )
+        )
+    if finished.has_gone_on:
+        parts.append(
+            Prose(
+                f"Warning: the run was trained on since: the figures are those of {summary.checkpoint}, its last "
+                f"checkpoint is {finished.checkpoint.path}. To evaluate that: python -m services.meta_train --resume "
+                f"{finished.folder}"
+            )
+        )
+    intervals = "Wilson's; of scores Student's, over episodes" if finished.best_score > 1 else "Wilson's"
+    beside = "; the paper's figures stand beside ours" if any(cell.paper for cell in summary.rows) else ""
+    parts.append(DataTable("Success rates", head, rows))
+    return [*parts, Prose(f"Shots are demonstrations adapted to. Intervals are {intervals}{beside}.")]
+
+
+def rates_of_tasks(finished: FinishedRun) -> Section:
+    """Return the section with each task's success rate, and its score where there are scores."""
+    parts: list[Part] = []
+    rates = estimates(finished.episodes, scores=False)
+    best = finished.best_score
+    scores = estimates(finished.episodes, scores=True) if best > 1 else {}
+    for split in dict.fromkeys(split for split, _, _ in rates):
+        parts.append(_bars(split, rates, "success rate", 1))
+        if scores:
+            parts.append(_bars(split, scores, "mean score", best))
+    head = ["task", "split", "shots", "successes", "success rate", "95% interval"]
+    rows = []
+    for (split, shots, task), rate in rates.items():
+        row = [task, split, shots, rate.counted, f"{rate.mean:.3f}", _interval(rate, 3)]
+        if scores:
+            score = scores[split, shots, task]
+            row += [f"{score.mean:.2f}", _interval(score, 2)]
+        rows.append(row)
+    head += [f"score of {best}", "interval of the score"] if scores else []
+    return Section("Success of each task", [*parts, DataTable("Each task", head, rows)])
+
+
+def _interval(estimate: Estimate, digits: int) -> str:
+    if estimate.low is None or estimate.high is None:
+        return ""
+    return f"{estimate.low:.{digits}f} to {estimate.high:.{digits}f}"
+
+
+def _bars(split: Split, found: Mapping[tuple[Split, int, str], Estimate], what: str, best: int) -> Picture:
+    """Draw a split's tasks, the best on top in all panels alike, one panel for each number of shots."""
+    by_shots: dict[int, dict[str, Estimate]] = defaultdict(dict)
+    for (own, shots, task), estimate in found.items():
+        if own == split:
+            by_shots[shots][task] = estimate
+    means = {task: sum(of[task].mean for of in by_shots.values()) for task in by_shots[min(by_shots)]}
+    tasks = sorted(means, key=lambda task: (means[task], task))
+    columns = min(len(by_shots), ABREAST)
+    rows = -(-len(by_shots) // columns)
+    height = rows * (0.9 + INCHES_A_TASK * len(tasks))
+    with panels(rows, columns, width=3.2 + 2.3 * columns, height=height) as (figure, axes):
+        for index, (axis, shots) in enumerate(zip(axes, sorted(by_shots), strict=False)):
+            own = [by_shots[shots][task] for task in tasks]
+            reach = list(zip(*(estimate.reach for estimate in own), strict=True))
+            axis.barh(range(len(tasks)), [e.mean for e in own], color=colour_of(0), alpha=0.75, height=0.7)
+            axis.errorbar([e.mean for e in own], range(len(tasks)), xerr=reach, fmt="none", ecolor=INK, capsize=2)
+            over_all = sum(estimate.mean for estimate in own) / len(own)
+            axis.axvline(over_all, linestyle="dashed", color=colour_of(3))
+            for place, estimate in enumerate(own):
+                axis.text(1.02, place, estimate.counted, transform=axis.get_yaxis_transform(), va="center", size=7.5)
+            axis.set(title=f"{shots}-shot: {over_all:.2f} on average", xlabel=what, xlim=(0, best * 1.02))
+            axis.set_yticks(range(len(tasks)), tasks if index % columns == 0 else [])
+            axis.set_ylim(-0.6, len(tasks) - 0.4)
+            axis.grid(visible=False, axis="y")
+        for axis in axes[len(by_shots) :]:
+            axis.remove()
+        return drawn(figure, f"{split}: {what} of each task", _in_words(by_shots, tasks, what))
+
+
+def _in_words(by_shots: Mapping[int, Mapping[str, Estimate]], tasks: Sequence[str], what: str) -> str:
+    told = []
+    for shots in sorted(by_shots):
+        own = by_shots[shots]
+        mean = sum(estimate.mean for estimate in own.values()) / len(own)
+        best, worst = tasks[-1], tasks[0]
+        ends = f", from {worst} with {own[worst].mean:.2f} to {best} with {own[best].mean:.2f}" if len(own) > 1 else ""
+        told.append(f"{shots}-shot {mean:.2f} on average (dashed){ends}")
+    what_it_is = f"Bars are a task's {what}, whiskers its 95% interval; the order is that of the mean over all shots"
+    return f"{what_it_is}: {'; '.join(told)}."

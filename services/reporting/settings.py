@@ -1,0 +1,91 @@
+"""A run's settings: those that differ from the nearest preset first, and as the flags that give them again."""
+
+import shlex
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from pydantic import BaseModel
+
+from dmil_core.configs import SIZES, ExperimentConfig, preset_of
+from services.reporting.finished import FinishedRun
+from services.reporting.page import DataTable, Prose, Section
+
+__all__ = ["Nearest", "flags", "nearest_preset", "settings_of_run"]
+
+
+class Nearest(NamedTuple):
+    """The preset that the fewest settings differ from."""
+
+    size: str
+    settings: dict[str, Any]
+    """Of it, by their full names, as training.iterations."""
+    differing: dict[str, Any]
+    """The settings that are not the preset's."""
+
+
+def nearest_preset(config: ExperimentConfig) -> Nearest:
+    """Return the preset of a run's own suite and method that is nearest to its settings."""
+    own = _flat(config.model_dump())
+    found = []
+    for size in SIZES:
+        preset = _flat(preset_of(config.suite.name, size, config.method.name).model_dump())
+        differing = {name: value for name, value in own.items() if name not in preset or preset[name] != value}
+        found.append(Nearest(size, preset, differing))
+    return min(found, key=lambda nearest: len(nearest.differing))
+
+
+def flags(settings: Mapping[str, Any]) -> str:
+    """Return settings as programs take them on their command lines."""
+    return " ".join(shlex.join(_flag(name, value)) for name, value in settings.items())
+
+
+def _flag(name: str, value: Any) -> list[str]:
+    section, dot, own = name.replace("_", "-").rpartition(".")
+    if isinstance(value, bool):
+        return [f"--{section}{dot}{own if value else f'no-{own}'}"]
+    values = value if isinstance(value, list | tuple) else [value]
+    return [f"--{section}{dot}{own}", *map(str, values)]
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    found = {}
+    for name, value in settings.items():
+        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return found
+
+
+def settings_of_run(finished: FinishedRun) -> Section:
+    """Return the section with all settings, those that differ from the nearest preset's apart."""
+    config = finished.config
+    size, preset, differing = nearest_preset(config)
+    meanings = dict(_meanings(config))
+    name = f"{size} of {config.method.name} on {config.suite.name}"
+    told = (
+        f"The preset {name} is the nearest; {len(differing)} of {len(preset)} settings differ from it."
+        if differing
+        else f"All settings are those of the preset {name}."
+    )
+    others = {name: value for name, value in _flat(config.model_dump()).items() if name not in differing}
+    changed = [[n, _shown(v), _shown(preset.get(n)), meanings.get(n, "")] for n, v in differing.items()]
+    same = [[n, _shown(v), meanings.get(n, "")] for n, v in others.items()]
+    parts = [Prose(told)]
+    if changed:
+        parts.append(DataTable("Settings that differ", ["setting", "here", f"in {size}", "what it is"], changed))
+    return Section(
+        "Settings", [*parts, DataTable("Settings as in the preset", ["setting", "value", "what it is"], same)]
+    )
+
+
+def _meanings(settings: BaseModel, prefix: str = "") -> Iterator[tuple[str, str]]:
+    for name, field in type(settings).model_fields.items():
+        value = getattr(settings, name)
+        if isinstance(value, BaseModel):
+            yield from _meanings(value, f"{prefix}{name}.")
+        elif field.description:
+            yield f"{prefix}{name}", " ".join(field.description.split())
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(map(str, value))
+    return "none" if value is None else str(value)
