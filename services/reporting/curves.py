@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -189,11 +189,11 @@ def _in_words(panel: Panel, curves: Sequence[Curve]) -> str:
 
 def _draw_lines(axis: Axes, curves: Sequence[Curve]) -> None:
     for index, curve in enumerate(curves):
-        style = {"color": colour_of(index), "linestyle": DASHES[index % len(DASHES)]}
+        style: dict[str, Any] = {"color": colour_of(index), "linestyle": DASHES[index % len(DASHES)]}
         marker = "." if len(curve.means) < FEW else None
         axis.plot(curve.iterations, curve.means, label=curve.label, marker=marker, **style)
         axis.fill_between(curve.iterations, curve.low, curve.high, color=colour_of(index), alpha=0.15, linewidth=0)
-    values = [value for curve in curves for value in curve.low + curve.means]
+    values = [value for curve in curves for value in (*curve.low, *curve.means)]
     if min(values) > 0 and max(values) > WIDE * min(values):
         axis.set_yscale("log")
     if len(curves) > 1:

@@ -89,7 +89,8 @@ def rates_of_tasks(finished: FinishedRun) -> Section:
     rates = estimates(finished.episodes, scores=False)
     best = finished.best_score
     scores = estimates(finished.episodes, scores=True) if best > 1 else {}
-    for split in dict.fromkeys(split for split, _, _ in rates):
+    splits: list[Split] = [split for split, _, _ in rates]
+    for split in dict.fromkeys(splits):
         parts.append(_bars(split, rates, "success rate", 1))
         if scores:
             parts.append(_bars(split, scores, "mean score", best))

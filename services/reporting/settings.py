@@ -8,7 +8,7 @@ from pydantic import BaseModel
 
 from dmil_core.configs import SIZES, ExperimentConfig, preset_of
 from services.reporting.finished import FinishedRun
-from services.reporting.page import DataTable, Prose, Section
+from services.reporting.page import DataTable, Part, Prose, Section
 
 __all__ = ["Nearest", "flags", "nearest_preset", "settings_of_run"]
 
@@ -68,7 +68,7 @@ def settings_of_run(finished: FinishedRun) -> Section:
     others = {name: value for name, value in _flat(config.model_dump()).items() if name not in differing}
     changed = [[n, _shown(v), _shown(preset.get(n)), meanings.get(n, "")] for n, v in differing.items()]
     same = [[n, _shown(v), meanings.get(n, "")] for n, v in others.items()]
-    parts = [Prose(told)]
+    parts: list[Part] = [Prose(told)]
     if changed:
         parts.append(DataTable("Settings that differ", ["setting", "here", f"in {size}", "what it is"], changed))
     return Section(

@@ -23,7 +23,7 @@ from dmil_core.errors import UserError
 from dmil_core.seeding import stream
 from dmil_core.statistics import Interval, interquartile_mean, mean_score, stratified_bootstrap, success_rate
 from services.published import Published
-from services.report import read_metrics
+from services.reporting.records import read_metrics
 from services.results import AdaptationResult, EpisodeResult, Split, read_rows
 from services.summary import sub_skill_use
 from services.sweeps.settings import Metric

@@ -69,7 +69,7 @@ def make_run(
             adaptations.append(AdaptationResult.model_validate({**row, **use}))
     write_rows(folder / "episodes.jsonl", found)
     write_rows(folder / "adaptations.jsonl", adaptations)
-    evaluation = Evaluation(checkpoint, protocol, best, {}, found, adaptations)
+    evaluation = Evaluation(checkpoint, protocol, best, {}, {}, found, adaptations)
     write_summary(summarise(evaluation, seconds={}, folder=folder), folder / "summary.json")
     records = [["metrics", {"step": i, "time": 0, "values": dict(own)}] for i, own in enumerate(metrics, 1)]
     (folder / "tracking.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))

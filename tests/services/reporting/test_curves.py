@@ -77,7 +77,6 @@ def test_nothing_measured_is_nothing_drawn():
     assert draw_metrics([{"iteration": 0, "success_rate/meta-testing/1-shot": 1.0}]) == []
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", LEARNERS)
 def test_whatever_our_methods_measure_has_its_panel(store: DemoStore, data, method: str):
     slots = alone(Experiment(smoke(method, 4), store), data).slots

@@ -88,7 +88,7 @@ def test_it_says_what_the_run_is_made_of_and_how_to_have_it_again(finished: Fini
         assert str(dataset).startswith(f"metaworld/{task}/")
         assert (count, failed) == (12, finished.summary.failed_attempts[str(task)])
         assert manifest.data[str(task)].startswith(str(digest))
-    assert dict(table(section, "Versions")) == manifest.versions
+    assert table(section, "Versions") == [list(version) for version in manifest.versions.items()]
     assert {"train", "evaluate", "total"} <= {row[0] for row in table(section, "Time")}
 
 
