@@ -118,11 +118,12 @@ class Experiment:
             store: where its demonstrations are, or will be.
 
         Raises:
-            UserError: for a suite, a task or a source of demonstrations that there is not, or iterations of a method
-                without meta-training.
+            UserError: for a suite, a method, a task or a source of demonstrations that there is not, or iterations of a
+                method without meta-training.
         """
         name, iterations = config.method.name, config.training.iterations
-        if iterations and not issubclass(method_type(name), MetaLearner):
+        kind = method_type(name)
+        if iterations and not issubclass(kind, MetaLearner):
             raise UserError(f"training.iterations: got {iterations}; wanted 0: {name} has no meta-training")
         self.config = config
         self.suite: TaskSuite = open_suite(config.suite)

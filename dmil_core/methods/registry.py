@@ -1,6 +1,6 @@
 """Methods by name: our own, and those that installed packages bring."""
 
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from dmil_core.errors import UserError, shown
@@ -33,42 +33,75 @@ GUIDE = "docs/your-own-method.md"
 
 
 class MethodError(UserError):
-    """A method that there is not, or a package's that cannot be used."""
+    """A method that there is not, that there is twice, or a package's that cannot be used."""
 
 
 def method_names() -> list[str]:
-    """Return the names of all methods."""
-    return [*OURS, *sorted(point.name for point in entry_points(group=ENTRY_POINTS))]
+    """Return the names of all methods.
+
+    Raises:
+        MethodError: if a package registers a name of ours, or two packages one name.
+    """
+    return [*OURS, *sorted(_registered())]
 
 
 def method_type(name: object) -> type[Standardised[Any]]:
     """Return the class of a method.
 
     Raises:
-        MethodError: for a name that no method has, or a package's class that cannot be imported or is none.
+        MethodError: for a name that no method has, a package's class that cannot be imported or is none, or, whatever
+            is asked for, as `method_names`.
     """
-    if isinstance(name, str) and name in OURS:
-        return OURS[name]
-    for point in entry_points(group=ENTRY_POINTS):
-        if point.name == name:
-            where = f"method.name: got {name}, {point.value}"
-            try:
-                found = point.load()
-            except Exception as error:  # importing a package runs its code, which may raise anything
-                raise MethodError(
-                    f"{where}, which cannot be imported: {type(error).__name__}: {error}; wanted what the entry point "
-                    "names; mend its package, or install it again"
-                ) from error
-            if not (isinstance(found, type) and issubclass(found, Standardised)):
-                raise MethodError(f"{where}: got {shown(found)}; wanted a class derived from Standardised; see {GUIDE}")
-            return found
+    registered = _registered()
+    if isinstance(name, str):
+        if name in OURS:
+            return OURS[name]
+        if name in registered:
+            return _loaded(registered[name])
     raise MethodError(f"method.name: got {shown(name)}; wanted one of {', '.join(method_names())}")
 
 
 def config_type(name: object) -> type[MethodConfig]:
     """Return the class of a method's settings.
 
+    Those of ours are found without a look at packages: presets are made of them while modules are imported, where an
+    error would not be told in words.
+
     Raises:
-        MethodError: as `method_type`.
+        MethodError: as `method_type`, if the name is none of ours.
     """
+    if isinstance(name, str) and name in OURS:
+        return OURS[name].config_type
     return method_type(name).config_type
+
+
+def _registered() -> dict[str, EntryPoint]:
+    """Return the methods of installed packages by name."""
+    found: dict[str, EntryPoint] = {}
+    for point in entry_points(group=ENTRY_POINTS):
+        if (ours := OURS.get(point.name)) is not None:
+            raise MethodError(
+                f"entry points {ENTRY_POINTS}: got {point.name} twice, our own {ours.__module__}:{ours.__name__} and "
+                f"{point.value}; wanted another name than any of ours; rename the package's, or uninstall it"
+            )
+        if (other := found.setdefault(point.name, point)).value != point.value:
+            raise MethodError(
+                f"entry points {ENTRY_POINTS}: got {point.name} twice, {other.value} and {point.value}; wanted one "
+                "package for each name; uninstall either"
+            )
+    return found
+
+
+def _loaded(point: EntryPoint) -> type[Standardised[Any]]:
+    """Import the class that a package registers."""
+    where = f"method.name: got {point.name}, {point.value}"
+    try:
+        found = point.load()
+    except Exception as error:  # importing a package runs its code, which may raise anything
+        raise MethodError(
+            f"{where}, which cannot be imported: {type(error).__name__}: {error}; wanted what the entry point names; "
+            "mend its package, or install it again"
+        ) from error
+    if not (isinstance(found, type) and issubclass(found, Standardised)):
+        raise MethodError(f"{where}: got {shown(found)}; wanted a class derived from Standardised; see {GUIDE}")
+    return found

@@ -10,31 +10,48 @@ from pathlib import Path
 import tyro
 
 from services.command_line import ConfigError, parse
+from services.experiment import RunnerKind, open_runner
 from services.progress import Bar, console
 from services.report import PAGE
+from services.reporting.adaptation_curves import adaptation_section, measure
 from services.reporting.curves import training_curves
+from services.reporting.embedding import embedding_section
 from services.reporting.finished import FinishedRun
+from services.reporting.lineup import has_sub_skills, line_up
 from services.reporting.page import Section, write_page
 from services.reporting.provenance import episodes_of_run, origin_of_run
 from services.reporting.rates import rates_of_tasks, table_of_all
 from services.reporting.settings import settings_of_run
+from services.reporting.sub_skills import sub_skill_sections
 
 __all__ = ["Arguments", "run", "write_run_page"]
 
-Writing = Callable[[FinishedRun], Section]
-SECTIONS: Sequence[Writing] = (
-    rates_of_tasks,
-    # failures
-    # sub-skills
-    # t-SNE
-    training_curves,
-    # adaptation
-    settings_of_run,
-    origin_of_run,
-    episodes_of_run,
-)
+Writing = Callable[[FinishedRun], Sequence[Section]]
+
+
+def _rates(finished: FinishedRun) -> list[Section]:
+    return [rates_of_tasks(finished)]
+
+
+def _sub_skills(finished: FinishedRun) -> list[Section]:
+    """Return what the high level chooses in tasks of meta-testing, and where, if there is a choice."""
+    if not has_sub_skills(finished):
+        return []
+    lineup = line_up({finished.name: finished})
+    return [*sub_skill_sections(lineup), embedding_section(lineup)]
+
+
+def _curves(finished: FinishedRun) -> list[Section]:
+    return [training_curves(finished), adaptation_section(finished)]
+
+
+def _origin(finished: FinishedRun) -> list[Section]:
+    return [settings_of_run(finished), origin_of_run(finished), episodes_of_run(finished)]
+
+
+SECTIONS: Sequence[Writing] = (_rates, _sub_skills, _curves, _origin)
 """Of the page, in their order."""
-AT_THE_END: Sequence[Writing] = (rates_of_tasks, training_curves, settings_of_run, origin_of_run, episodes_of_run)
+AT_THE_END: Sequence[Writing] = (_rates, _curves, _origin)
 """Those for which it is enough to read the run's folder: a run writes them when it ends."""
 
 
@@ -48,13 +65,20 @@ class Arguments:
     """The folder that runs' own folders are in."""
     output: Path | None = None
     """The file to write; report/report.html in the run's folder if not given."""
+    adaptation: bool = False
+    """Also measure success and loss over fine-tuning steps, for 1, 3, 5 and 10 shots, in at most four meta-testing
+    tasks: some minutes, once; the page shows it from then on."""
+    runner: RunnerKind = "ray"
+    """Where to measure: in Ray actors, or in this process; the result is the same."""
+    workers: int | None = None
+    """Ray workers, one for each CPU of the cluster if not given."""
 
 
 def write_run_page(
     finished: FinishedRun,
     path: Path,
     sections: Sequence[Writing] = AT_THE_END,
-    tell: Callable[[Section], None] = lambda written: None,
+    tell: Callable[[], None] = lambda: None,
 ) -> None:
     """Write the page of a run.
 
@@ -62,16 +86,16 @@ def write_run_page(
         finished: the run.
         path: of the file.
         sections: of the page.
-        tell: is called with each section, as soon as it is there.
+        tell: is called after each of `sections`.
 
     Raises:
         UserError: for a file of the run that is missing or damaged.
         DiskFullError: for want of space.
     """
-    written = []
+    written: list[Section] = []
     for write in sections:
-        written.append(write(finished))
-        tell(written[-1])
+        written += write(finished)
+        tell()
     config = finished.config
     title = f"{finished.name}: {config.method.name} on {config.suite.name}"
     write_page(path, title, table_of_all(finished), written)
@@ -85,7 +109,10 @@ def run(arguments: Sequence[str]) -> None:
     if path.is_dir():
         raise ConfigError(f"--output: got {path}, a folder; wanted a file, as {path / PAGE}")
     path.parent.mkdir(parents=True, exist_ok=True)
+    if given.adaptation:
+        with open_runner(given.runner, finished.experiment.suite, given.workers) as runner:
+            measure(finished, runner)
     with Bar("report", len(SECTIONS)) as bar:
-        write_run_page(finished, path, SECTIONS, lambda section: bar.advance(1, section.title))
+        write_run_page(finished, path, SECTIONS, lambda: bar.advance(1))
     console.print(f"report: {path} ({path.stat().st_size / 1e6:.1f} MB)", markup=False)
     console.print(f"open it in a browser: {path.absolute().as_uri()}", markup=False)

@@ -262,6 +262,21 @@ def test_an_installed_method_is_meta_trained_to_its_table(programs, workplace: P
     assert code == 2, printed
 
 
+def test_a_package_s_method_with_a_name_of_ours_is_told_in_words(programs, workplace: Path, monkeypatch):
+    """In a process of its own: nothing goes wrong before there is somebody to tell."""
+    information = workplace / "lib" / "more-1.0.dist-info"
+    information.mkdir(parents=True)
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: more\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text("[dmil.methods]\nnearest-neighbour = more_methods:Nearest\n")
+    paths = filter(None, (os.environ.get("PYTHONPATH"), str(workplace / "lib")))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
+    code, printed = programs("meta_train", "--method", "nearest-neighbour", "--preset", "smoke", "--runner", "local")
+    assert code == 2, printed
+    assert "error: entry points dmil.methods: got nearest-neighbour twice, our own dmil_core.methods.near" in printed
+    assert "Traceback" not in printed
+    assert not (workplace / "runs").exists()
+
+
 def test_the_page_says_what_the_example_does():
     page = (PROJECT / "docs" / "your-own-method.md").read_text()
     source = (EXAMPLE / "reptile.py").read_text()

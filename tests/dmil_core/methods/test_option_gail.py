@@ -9,23 +9,8 @@ import torch
 from torch.distributions import Normal
 
 from dmil_core.configs import SIZES, EvaluationConfig, TrainingConfig
-from dmil_core.demonstrations import Demonstration
 from dmil_core.losses import Steps
 from dmil_core.methods.base import FineTuning, MetaLearner, Policy, PractisingLearner, Rollout
-from dmil_core.methods.option_adversary import (
-    Aims,
-    Played,
-    aims_of,
-    decisions,
-    discriminate,
-    discriminator_logits,
-    discriminator_loss,
-    high_values,
-    imitation_rewards,
-    improve,
-    low_values,
-    orthogonal,
-)
 from dmil_core.methods.option_gail import (
     OptionGail,
     OptionGailConfig,
@@ -33,72 +18,15 @@ from dmil_core.methods.option_gail import (
     OptionGailOfflineConfig,
     OptionMaterial,
 )
-from dmil_core.methods.option_policies import OptionExplorer
-from dmil_core.methods.options import Chain, OptionModel, log_likelihood, options_before, viterbi
+from dmil_core.methods.options import Chain, log_likelihood, viterbi
 from dmil_core.networks import Parameters, flatten, unflatten
 from dmil_core.seeding import stream
+from tests.dmil_core.methods.conftest import OFFLINE, PLAYING, drawn_parameters, model_of
 from tests.dmil_core.methods.toys import STEPS, meta_trained, practise, record, recovered, training_sets
-
-OFFLINE = OptionGailOfflineConfig(hidden_layers=2, hidden_units=8, trajectories=3, likelihood_iterations=2)
-PLAYING = OptionGailConfig(
-    hidden_layers=2,
-    hidden_units=8,
-    trajectories=3,
-    likelihood_iterations=2,
-    offline_iterations=4,
-    offline_steps=1,
-    environment_steps=9,
-    minibatch=4,
-    discriminator_passes=2,
-    policy_epochs=2,
-    discriminator_units=8,
-    critic_units=8,
-)
-
-
-@pytest.fixture
-def demonstrations(make_demonstrations) -> list[Demonstration]:
-    return make_demonstrations(0, [7, 3, 9, 1, 6])
-
-
-@pytest.fixture
-def offline(demonstrations) -> OptionGailOffline:
-    return OptionGailOffline.prepared(OFFLINE, 3, demonstrations)
-
-
-@pytest.fixture
-def playing(demonstrations) -> OptionGail:
-    return OptionGail.prepared(PLAYING, 3, demonstrations)
-
-
-@pytest.fixture
-def rollouts() -> list[Rollout]:
-    draw = np.random.default_rng(5)
-    return [
-        Rollout(
-            draw.normal(size=(steps + 1, 4)).astype(np.float32),
-            draw.normal(size=(steps, 3)).astype(np.float32),
-            draw.integers(0, 3, steps),
-            success,
-            ended=True,
-        )
-        for steps, success in ((5, True), (1, False), (3, False))
-    ]
-
-
-def drawn_parameters(method: OptionGailOffline | OptionGail) -> Parameters:
-    """Draw parameters of which none is zero."""
-    generator = torch.Generator().manual_seed(1)
-    drawn = method.initial_parameters(stream(0, "initial"))
-    return {name: tensor + 0.3 * torch.randn(tensor.shape, generator=generator) for name, tensor in drawn.items()}
 
 
 def like(gradient: torch.Tensor, parameters: Parameters) -> Parameters:
     return unflatten(gradient, {name: tensor.shape for name, tensor in parameters.items()})
-
-
-def model_of(parameters: Parameters) -> OptionModel:
-    return OptionModel.of(parameters, -20.0)
 
 
 def test_they_are_what_their_types_say(offline, playing) -> None:
@@ -159,14 +87,6 @@ def test_initial_parameters_have_the_sizes_of_the_settings(offline, playing) -> 
         assert {name: tuple(tensor.shape) for name, tensor in drawn.items()} == expected
         again = method.initial_parameters(stream(0, "initial"))
         assert torch.equal(flatten(drawn), flatten(again))
-
-
-def test_orthogonal_weights_keep_lengths() -> None:
-    drawn = orthogonal("critic", [4, 8, 8, 3], np.random.default_rng(0))
-    first, second, last = (drawn[f"critic.{layer}.weight"] for layer in range(3))
-    torch.testing.assert_close(first.T @ first, 2 * torch.eye(4))
-    torch.testing.assert_close(second.T @ second, 2 * torch.eye(8))
-    torch.testing.assert_close(last @ last.T, torch.eye(3))
 
 
 @pytest.mark.parametrize(
@@ -278,201 +198,6 @@ def test_adaptation_raises_the_likelihood_of_the_support(offline, demonstrations
     assert found[1] > found[0]
 
 
-def test_the_most_probable_option_after_the_last_one_acts(offline, demonstrations, plain_mlp) -> None:
-    parameters = drawn_parameters(offline)
-    policy = offline.adapt(parameters, demonstrations[:1], FineTuning(0, 0.01))
-    assert policy.start(2).tolist() == [[3], [3]]
-    observations = np.concatenate([one.observations for one in demonstrations])
-    last = np.random.default_rng(0).integers(0, 4, (len(observations), 1))
-    decision = policy.act(observations, last)
-    states, model = torch.from_numpy(offline.standardise(observations)), model_of(parameters)
-    assert len(set(decision.sub_skills.tolist())) > 1
-    for state, before, option, action in zip(states, last[:, 0], decision.sub_skills, decision.actions, strict=True):
-        assert option == plain_mlp(model.high, state).view(4, 3)[before].argmax()
-        np.testing.assert_allclose(action, plain_mlp(model.low[option], state), rtol=1e-4, atol=1e-5)
-    assert np.array_equal(decision.memory[:, 0], decision.sub_skills)
-
-
-def test_sub_skill_use_is_what_the_policy_takes_and_the_best_fit(offline, demonstrations) -> None:
-    parameters, shown = drawn_parameters(offline), demonstrations[2]
-    policy = offline.adapt(parameters, demonstrations[:1], FineTuning(0, 0.01))
-    use, memory, taken = policy.sub_skill_use(shown), policy.start(1), []
-    for observation in shown.observations:
-        decision = policy.act(observation[None], memory)
-        memory = decision.memory
-        taken.append(decision.sub_skills.item())
-    assert use.chosen.tolist() == taken
-    steps, model = Steps.of([shown], offline.standardise), model_of(parameters)
-    assert use.best.tolist() == model.log_low(steps.states, steps.actions).argmax(1).tolist()
-
-
-def explorer_of(method: OptionGail, seed: int, demonstrations: list[Demonstration]) -> OptionExplorer:
-    material = replace(method.sample(demonstrations, 4, stream(0, "batch")), seed=seed)
-    return method.explorer(drawn_parameters(method), material)
-
-
-def test_what_is_drawn_does_not_depend_on_who_else_acts(playing, demonstrations) -> None:
-    explorer = explorer_of(playing, 7, demonstrations)
-    observations = np.random.default_rng(1).normal(size=(4, 5, 4)).astype(np.float32)
-
-    def act(dropped_at: dict[int, int]) -> dict[tuple[int, int], tuple[int, np.ndarray]]:
-        alive, memory, done = np.arange(5), explorer.start(5), {}
-        for step, seen in enumerate(observations):
-            going = np.array([dropped_at.get(int(one), 9) > step for one in alive])
-            alive, memory = alive[going], memory[going]
-            decision = explorer.act(seen[alive], memory)
-            memory = decision.memory
-            for one, option, action in zip(alive.tolist(), decision.sub_skills, decision.actions, strict=True):
-                done[one, step] = int(option), action
-        return done
-
-    everything = act({})
-    some = act({0: 1, 3: 2, 4: 1})
-    assert len(some) == 1 + 4 + 4 + 2 + 1
-    for at, (option, action) in some.items():
-        assert option == everything[at][0]
-        np.testing.assert_allclose(action, everything[at][1], rtol=1e-5, atol=1e-6)
-
-
-def test_episodes_begun_one_by_one_differ_by_their_first_observation(playing, demonstrations) -> None:
-    explorer, other_seed = (explorer_of(playing, seed, demonstrations) for seed in (7, 8))
-    first, second = np.random.default_rng(1).normal(size=(2, 1, 4)).astype(np.float32)
-
-    def noise(policy: OptionExplorer, begun: np.ndarray) -> np.ndarray:
-        """Draw two steps' actions, the second in the same state whatever came first."""
-        memory = policy.act(begun, policy.start(1)).memory
-        assert memory[0, 1] == 1
-        decision = policy.act(first, memory)
-        states = torch.from_numpy(policy.standardise(first))
-        options = torch.from_numpy(decision.sub_skills)
-        mean, deviation = policy.model.means(states, options), policy.model.log_deviations[options].exp()
-        return (decision.actions - mean.numpy()) / deviation.numpy()
-
-    np.testing.assert_allclose(noise(explorer, first), noise(explorer, first))
-    assert not np.allclose(noise(explorer, first), noise(explorer, second))
-    assert not np.allclose(noise(explorer, first), noise(other_seed, first))
-
-
-def test_draws_are_from_the_model(playing, demonstrations) -> None:
-    explorer, count = explorer_of(playing, 7, demonstrations), 4000
-    observations = np.repeat(demonstrations[0].observations[:1], count, axis=0)
-    memory = explorer.start(count)
-    memory[:, 0] = 1
-    decision = explorer.act(observations, memory)
-    state = torch.from_numpy(explorer.standardise(observations[:1]))
-    shares = np.bincount(decision.sub_skills, minlength=3) / count
-    np.testing.assert_allclose(shares, explorer.model.log_high(state)[0, 1].exp().numpy(), atol=0.03)
-    for k in range(3):
-        own = decision.actions[decision.sub_skills == k]
-        deviations = explorer.model.log_deviations[k].exp().numpy()
-        np.testing.assert_allclose(
-            (own.mean(0) - explorer.model.means(state, torch.tensor([k])).numpy()[0]) / deviations,
-            np.zeros(3),
-            atol=4 / len(own) ** 0.5,
-        )
-        np.testing.assert_allclose(own.std(0) / deviations, np.ones(3), atol=4 / len(own) ** 0.5)
-
-
-def test_loss_and_reward_are_those_of_the_sigmoid() -> None:
-    of_policy, of_expert = torch.tensor([2.0, -1.0]), torch.tensor([0.5])
-    expected = -of_policy.sigmoid().log().mean() - (1 - of_expert.sigmoid()).log().mean()
-    torch.testing.assert_close(discriminator_loss(of_policy, of_expert), expected)
-    torch.testing.assert_close(imitation_rewards(of_policy), -of_policy.sigmoid().log())
-    assert imitation_rewards(torch.tensor([200.0, 0.0])).tolist() == pytest.approx([0.0, np.log(2)])
-
-
-@pytest.fixture
-def played(playing, rollouts) -> Played:
-    return Played.of_rollouts(rollouts, playing.standardise, 3)
-
-
-def test_rollouts_lie_one_after_the_other(playing, played, rollouts) -> None:
-    assert played.steps.lengths.tolist() == [5, 1, 3]
-    assert [played.before[t].item() for t in (0, 5, 6)] == [3, 3, 3]
-    assert torch.equal(played.before, options_before(played.options, played.steps.lengths, 3))
-    np.testing.assert_allclose(played.steps.states[6:], playing.standardise(rollouts[2].observations[:3]))
-    np.testing.assert_allclose(played.steps.actions[6:], rollouts[2].actions)
-    some = played.at(torch.tensor([6, 1]))
-    assert some.before.tolist() == [3, played.options[0].item()]
-    assert torch.equal(some.steps.actions, played.steps.actions[[6, 1]])
-
-
-def test_logits_are_indexed_by_the_option_before_and_at(playing, played, plain_mlp) -> None:
-    parameters = drawn_parameters(playing)
-    judge = tuple((parameters[f"discriminator.{n}.weight"], parameters[f"discriminator.{n}.bias"]) for n in range(3))
-    found = discriminator_logits(parameters, played, 3)
-    for t, logit in enumerate(found):
-        outputs = plain_mlp(judge, torch.cat([played.steps.states[t], played.steps.actions[t]])).view(4, 3)
-        torch.testing.assert_close(logit, outputs[played.before[t], played.options[t]])
-
-
-def test_the_discriminator_learns_to_tell_them_apart(playing, played, demonstrations) -> None:
-    steps = Steps.of(demonstrations, playing.standardise)
-    expert = Played.of(steps._replace(actions=steps.actions + 3), torch.zeros(len(steps.states), dtype=torch.int64), 3)
-    config = PLAYING.model_copy(update={"discriminator_passes": 100, "learning_rate": 1e-2})
-    moved = {name: tensor.clone().requires_grad_() for name, tensor in drawn_parameters(playing).items()}
-    before = {name: tensor.detach().clone() for name, tensor in moved.items()}
-    metrics = discriminate(moved, played, expert, config, torch.Generator().manual_seed(0))
-    assert metrics["discriminator_accuracy"] == 1
-    with torch.no_grad():
-        of_policy, of_expert = (discriminator_logits(moved, side, 3) for side in (played, expert))
-    assert imitation_rewards(of_expert).min() > imitation_rewards(of_policy).max()
-    for name, tensor in moved.items():
-        assert torch.equal(tensor, before[name]) == (not name.startswith("discriminator"))
-
-
-def test_aims_follow_from_the_values_of_both_levels(playing, played, rollouts) -> None:
-    parameters, discount, both = drawn_parameters(playing), PLAYING.discount, PLAYING.discount * PLAYING.smoothing
-    rewards = torch.rand(9, generator=torch.Generator().manual_seed(0))
-    beyond = torch.from_numpy(playing.standardise(np.stack([one.observations[-1] for one in rollouts])))
-    found = aims_of(parameters, played, rewards, beyond, PLAYING)
-
-    with torch.no_grad():
-        low = low_values(parameters, played)
-        high = high_values(parameters, played.steps.states, played.before, PLAYING)
-        chances = model_of(parameters).log_high(played.steps.states).exp()
-        for t in range(9):
-            of_each = [
-                low_values(parameters, played.at(torch.tensor([t]))._replace(options=torch.tensor([option])))
-                for option in range(3)
-            ]
-            torch.testing.assert_close(high[t], (chances[t, played.before[t]] * torch.cat(of_each)).sum())
-        last = high_values(parameters, beyond, played.options[[4, 5, 8]], PLAYING)
-
-    def advantages(values: torch.Tensor) -> torch.Tensor:
-        each = []
-        for first, end, after in ((0, 5, last[0]), (5, 6, last[1]), (6, 9, last[2])):
-            later = torch.cat([values[first + 1 : end], after[None]])
-            errors = (rewards - rewards.mean())[first:end] + discount * later - values[first:end]
-            each += [sum(both**n * error for n, error in enumerate(errors[t:])) for t in range(end - first)]
-        return torch.stack(each)
-
-    for of_level, values in ((found.high, high), (found.low, low)):
-        expected = advantages(values)
-        expected = (expected - expected.mean()) / expected.std(correction=0)
-        torch.testing.assert_close(of_level, expected, rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(found.returns, advantages(low) + low, rtol=1e-4, atol=1e-5)
-
-
-def test_improvement_follows_the_advantages_of_each_level(playing, played) -> None:
-    liked = (played.options == 1).float() * 2 - 1
-    high_up = played.steps.actions[:, 0].sign()
-    aims = Aims(liked, high_up, torch.full((9,), 0.5))
-    config = PLAYING.model_copy(update={"policy_epochs": 30, "learning_rate": 1e-3})
-    moved = {name: tensor.clone().requires_grad_() for name, tensor in drawn_parameters(playing).items()}
-    before = {name: tensor.detach().clone() for name, tensor in moved.items()}
-    metrics = improve(moved, played, aims, config, torch.Generator().manual_seed(0))
-    with torch.no_grad():
-        old, new = (decisions(parameters, played, config) for parameters in (before, moved))
-        errors = [low_values(parameters, played) - 0.5 for parameters in (before, moved)]
-    assert ((new.high - old.high) * liked).mean() > 0
-    assert ((new.low - old.low) * high_up).mean() > 0
-    assert errors[1].square().mean() < errors[0].square().mean()
-    assert metrics["value_error"] == pytest.approx(errors[1].square().mean().item())
-    for name, tensor in moved.items():
-        assert torch.equal(tensor, before[name]) == name.startswith("discriminator")
-
-
 def test_a_round_is_pure_and_reports_what_it_took(playing, demonstrations, rollouts) -> None:
     parameters = drawn_parameters(playing)
     before = flatten(parameters)
@@ -490,31 +215,6 @@ def test_a_round_is_pure_and_reports_what_it_took(playing, demonstrations, rollo
     assert found.metrics["environment_steps"] == 9
     assert found.metrics["practice_success"] == pytest.approx(1 / 3)
     assert all(way.any() for way in like(found.gradient, parameters).values())
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_practice_improves_a_known_reward() -> None:
-    """The explorer, the advantages and PPO, with a reward in place of the discriminator's: where to go, and how."""
-    demonstrations = record(0, 2).demonstrations
-    config = PLAYING.model_copy(
-        update={"sub_skills": 2, "hidden_layers": 1, "hidden_units": 16, "output_scale": 0.1}
-        | {"learning_rate": 3e-3, "minibatch": 64, "policy_epochs": 4, "discount": 0.9}
-    )
-    method = OptionGail.prepared(config, 2, demonstrations)
-    moved = {name: tensor.requires_grad_() for name, tensor in method.initial_parameters(stream(0, "initial")).items()}
-    means = []
-    for iteration in range(25):
-        material = method.sample(demonstrations, config.offline_iterations, stream(0, "batch", iteration))
-        rollouts = practise(method.explorer(moved, material), "task-0", iteration, 5 * STEPS)
-        played = Played.of_rollouts(rollouts, method.standardise, 2)
-        rewards = -(played.steps.actions - torch.tensor([-1.0, 0.5])).square().sum(1) + 2.0 * (played.options == 1)
-        last = torch.from_numpy(method.standardise(np.stack([one.observations[-1] for one in rollouts])))
-        aims = aims_of(moved, played, rewards, last, config)
-        improve(moved, played, aims, config, torch.Generator().manual_seed(iteration))
-        means.append(rewards.mean().item())
-    # At first −(1² + 0.5² + 2σ²) + 1 = −2.25; at best 2, less 2σ².
-    assert means[0] == pytest.approx(-2.25, abs=0.5)
-    assert means[-1] > 0.5
 
 
 @pytest.mark.usefixtures("unchecked")

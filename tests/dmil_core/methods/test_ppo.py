@@ -1,4 +1,4 @@
-"""Generalised advantages and the clipped surrogate, against their sums and RLlib's own."""
+"""Advantages and the clipped surrogate, against their sums and RLlib's own."""
 
 import warnings
 
@@ -6,7 +6,19 @@ import numpy as np
 import pytest
 import torch
 
-from dmil_core.methods.ppo import clipped_surrogate, generalised_advantages
+from dmil_core.methods.ppo import (
+    clipped_surrogate,
+    generalised_advantages,
+    scaled,
+    standardised,
+    trajectory_advantages,
+)
+
+
+def sums_of_errors(rewards: np.ndarray, values: np.ndarray, discount: float, trace: float) -> list[float]:
+    """Return the advantages of one episode, each summed anew; `values` has one more, of the state beyond the end."""
+    errors = rewards + discount * values[1:] - values[:-1]
+    return [sum((discount * trace) ** n * error for n, error in enumerate(errors[t:])) for t in range(len(errors))]
 
 
 @pytest.mark.parametrize("steps", [1, 2, 7])
@@ -15,13 +27,7 @@ from dmil_core.methods.ppo import clipped_surrogate, generalised_advantages
 def test_advantages_are_the_discounted_sum_of_errors(steps: int, discount: float, smoothing: float) -> None:
     draw = np.random.default_rng(steps)
     rewards, values = draw.normal(size=steps), draw.normal(size=steps + 1)
-    expected = [
-        sum(
-            (discount * smoothing) ** (later - t) * (rewards[later] + discount * values[later + 1] - values[later])
-            for later in range(t, steps)
-        )
-        for t in range(steps)
-    ]
+    expected = sums_of_errors(rewards, values, discount, smoothing)
     np.testing.assert_allclose(generalised_advantages(rewards, values, discount, smoothing), expected)
 
 
@@ -75,3 +81,29 @@ def test_the_surrogate_is_the_mean_over_steps() -> None:
     log_ratios, advantages = torch.tensor([0.0, 0.1, -0.1]), torch.tensor([1.0, -1.0, 3.0])
     each = [clipped_surrogate(log_ratios[t : t + 1], advantages[t : t + 1], 0.2) for t in range(3)]
     torch.testing.assert_close(clipped_surrogate(log_ratios, advantages, 0.2), torch.stack(each).mean())
+
+
+@pytest.mark.parametrize("discount", [0.0, 0.5, 0.99])
+@pytest.mark.parametrize("trace", [0.0, 0.9])
+def test_advantages_are_the_discounted_sums_of_surprises(discount: float, trace: float) -> None:
+    lengths = [4, 1, 6, 2]
+    random = np.random.default_rng(0)
+    rewards, values = random.normal(size=(2, sum(lengths)))
+    expected, start = [], 0
+    for length in lengths:
+        end = start + length
+        expected += sums_of_errors(rewards[start:end], np.append(values[start:end], 0.0), discount, trace)
+        start = end
+    found = trajectory_advantages(
+        torch.from_numpy(rewards), torch.from_numpy(values), torch.tensor(lengths), discount, trace
+    )
+    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-12)
+    if not discount:
+        np.testing.assert_array_equal(found.numpy(), rewards - values)
+
+
+def test_rewards_are_scaled_and_advantages_standardised() -> None:
+    draws = torch.tensor([-3.0, -4.0, 0.0, 5.0])
+    np.testing.assert_allclose(scaled(draws), draws / (50 / 4) ** 0.5, rtol=1e-6)
+    np.testing.assert_allclose(standardised(draws), (draws + 0.5) / 12.25**0.5, rtol=1e-6)
+    assert scaled(torch.zeros(2)).tolist() == standardised(torch.full((2,), 3.0)).tolist() == [0.0, 0.0]

@@ -11,12 +11,12 @@ import numpy as np
 
 from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration
-from dmil_core.methods.base import MetaLearner, Policy, Rollout
+from dmil_core.methods.base import Decision, MetaLearner, Policy, Rollout
 from dmil_core.networks import Parameters, flatten, unflatten
 from dmil_core.outer_loop import OuterState, OuterStep, Practise, group_gradient, groups, tasks_of
 from dmil_core.seeding import stream
 
-__all__ = ["STEPS", "Recorded", "meta_trained", "practise", "record", "recovered", "training_sets"]
+__all__ = ["STEPS", "Recorded", "act_along", "meta_trained", "practise", "record", "recovered", "training_sets"]
 
 STEPS, SPEED = 40, 0.05
 DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0]])
@@ -66,6 +66,15 @@ def record(task: int, episodes: int) -> Recorded:
 def training_sets(tasks: int = 8, episodes: int = 16) -> dict[str, Sequence[Demonstration]]:
     """Return the demonstrations of tasks 0, 1, and so on, half of either order, by name."""
     return {f"task-{task}": record(task, episodes).demonstrations for task in range(tasks)}
+
+
+def act_along(policy: Policy, demonstration: Demonstration) -> list[Decision]:
+    """Let a policy choose at each state of a demonstration in turn, whatever comes of it there."""
+    memory, decisions = policy.start(1), []
+    for observation in demonstration.observations:
+        decisions.append(policy.act(observation[None], memory))
+        memory = decisions[-1].memory
+    return decisions
 
 
 def practise(policy: Policy, task: str, seed: int, steps: int) -> list[Rollout]:

@@ -1,0 +1,112 @@
+"""Delivery of what waits: all of it and once, by one process at a time."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mlflow import MlflowClient
+
+from dmil_core.errors import UserError
+from services.tracking import Tracker
+from services.tracking.delivery import RUN_TAG, Delivery, Identity, IdentityError
+from tests.services.tracking.conftest import steps
+
+PROJECT = Path(__file__).parents[3]
+
+DIES = """
+import os, signal, sys
+from pathlib import Path
+from services.tracking.delivery import Delivery
+field = sys.argv[3]
+note = Delivery._note
+def die(delivery, **changed):
+    if field in changed and changed.get("delivered", 3) >= 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    note(delivery, **changed)
+Delivery._note = die
+Delivery(Path(sys.argv[1]), sys.argv[2]).deliver()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.alone
+@pytest.mark.usefixtures("no_mlflow")
+def test_what_mlflow_took_before_a_kill_kept_us_from_noting_it_is_there_once(tmp_path: Path, mlflow_file: str):
+    (tmp_path / "table.md").write_text("a table")
+    tracker = Tracker(tmp_path, "killed", print)
+    tracker.parameters({"seed": 0})
+    for step in range(1, 2501):
+        tracker.metrics(step, {"loss": 1 / step, "constant": 1.0})
+    tracker.inputs({"push": "0" * 64})
+    tracker.artifact(tmp_path / "table.md")
+    assert not tracker.close("FINISHED")
+    before = Identity.of(tmp_path)
+    for field in ("run_id", "delivered"):
+        died = subprocess.run([sys.executable, "-c", DIES, str(tmp_path), mlflow_file, field], cwd=PROJECT)
+        assert died.returncode == -signal.SIGKILL
+        delivered = Identity.of(tmp_path)
+        assert delivered == (before if field == "run_id" else before.model_copy(update=delivered_two(delivered)))
+
+    delivery = Delivery(tmp_path, mlflow_file)
+    delivery.deliver()
+    delivery.close()
+    client = MlflowClient(mlflow_file)
+    experiment = client.get_experiment_by_name("killed")
+    assert experiment is not None
+    (run,) = client.search_runs([experiment.experiment_id])
+    assert run.data.tags[RUN_TAG] == before.tag
+    assert run.data.params == {"seed": "0"}
+    assert run.inputs is not None
+    assert len(run.inputs.dataset_inputs) == 1
+    for name in ("loss", "constant"):
+        assert steps(mlflow_file, run.info.run_id, name) == list(range(1, 2501)), name
+
+
+def delivered_two(identity: Identity) -> dict[str, object]:
+    """Return what the begin and the parameters change in an identity."""
+    assert identity.run_id is not None
+    return {"run_id": identity.run_id, "delivered": 2}
+
+
+@pytest.mark.usefixtures("no_mlflow")
+def test_who_takes_over_begins_where_the_other_ended(tmp_path: Path, mlflow_file: str):
+    Tracker(tmp_path, "an experiment", print).close("FINISHED")
+    one, other = Delivery(tmp_path, mlflow_file), Delivery(tmp_path, mlflow_file)
+    one.deliver()
+    one.close()
+    other.deliver()
+    other.close()
+    assert (other.run_id, other.delivered) == (one.run_id, 2)
+
+
+@pytest.mark.parametrize("content", ["", "no JSON", "{}", '{"run_id": "x", "delivered": 1}'])
+def test_a_damaged_identity_is_named(tmp_path: Path, content: str):
+    (tmp_path / "mlflow_run.json").write_text(content)
+    with pytest.raises(IdentityError, match=r"mlflow_run\.json: got .*delete it") as caught:
+        Tracker(tmp_path, "an experiment", print)
+    assert isinstance(caught.value, UserError)
+
+
+def test_more_delivered_than_there_is_is_refused(tmp_path: Path):
+    identity = Identity.found_or_made(tmp_path, "an experiment").model_copy(update={"delivered": 2})
+    (tmp_path / "mlflow_run.json").write_text(identity.model_dump_json())
+    (tmp_path / "tracking.jsonl").write_text('["tags", {}]\n')
+    with pytest.raises(IdentityError, match="got 2 records delivered; wanted at most the 1 of"):
+        Delivery(tmp_path, "sqlite://")
+
+
+@pytest.mark.usefixtures("no_mlflow")
+def test_an_artifact_that_is_gone_does_not_hold_up_the_others(tmp_path: Path, mlflow_file: str):
+    (tmp_path / "gone.md").write_text("gone")
+    tracker = Tracker(tmp_path, "an experiment", print)
+    tracker.artifact(tmp_path / "gone.md")
+    tracker.close("FINISHED")
+    (tmp_path / "gone.md").unlink()
+    delivery = Delivery(tmp_path, mlflow_file)
+    delivery.deliver()
+    delivery.close()
+    run = MlflowClient(mlflow_file).get_run(str(delivery.run_id))
+    assert run.info.status == "FINISHED"
+    assert run.data.tags["missing.gone.md"] == "was gone before MLflow could be given it"

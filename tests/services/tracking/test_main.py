@@ -1,0 +1,75 @@
+"""The program that delivers what a run left behind, and counts it."""
+
+from pathlib import Path
+
+import pytest
+from mlflow import MlflowClient
+
+from dmil_core.errors import RunError
+from services.checkpoints import Checkpoint
+from services.tracking import Tracker
+from services.tracking.__main__ import run as tracking_program
+from services.tracking.delivery import BusyError, Delivery, Identity
+from services.tracking.spool import read_spool
+from tests.services.tracking.conftest import records, steps
+
+
+def test_with_no_server_training_ends_and_a_flush_delivers(
+    train, programs, workplace: Path, free_port, mlflow_file: str, monkeypatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"http://127.0.0.1:{free_port()}")
+    checkpoint: Checkpoint = train("run", "--training.iterations", "3")
+    printed = capsys.readouterr().out
+    folder = workplace / "runs" / "run"
+    count = len((folder / "tracking.jsonl").read_text().splitlines())
+    assert checkpoint.manifest.iteration == 3
+    assert checkpoint.manifest.mlflow_run_id is None
+    assert printed.count("does not take records") == 1
+    assert printed.count(f"{count} of {count} MLflow records wait in runs/run/tracking.jsonl") == 1
+    assert printed.count("python -m services.tracking flush runs/run") == 1
+    done = [measured.step for measured in records(folder, "metrics") if "gradient_norm" in measured.values]
+    assert done == [1, 2, 3]
+    assert {line.kind for line in read_spool(folder / "tracking.jsonl")} == {
+        "begin", "parameters", "tags", "inputs", "metrics", "artifact", "end",
+    }  # fmt: skip
+    assert (folder / "summary.json").exists()
+
+    with pytest.raises(RunError, match=f"MLflow at http://127.0.0.1.* 0 of {count} were delivered"):
+        tracking_program(["flush", "run"])
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", mlflow_file)
+    code, printed = programs("tracking", "flush", "runs/run")
+    assert (code, printed.count(f"delivered: {count} of {count} records")) == (0, 1), printed
+    tracking_program(["flush", "run"])
+    tracking_program(["status", "run"])
+    run_id = Identity.of(folder).run_id
+    assert capsys.readouterr().out.splitlines() == [
+        f"delivered: 0 of 0 records, MLflow run {run_id}",
+        f"MLflow run: {run_id}",
+        f"records: {count}, delivered {count}, waiting 0",
+    ]
+    assert steps(mlflow_file, run_id, "gradient_norm") == [1, 2, 3]
+    run = MlflowClient(mlflow_file).get_run(str(run_id))
+    (began, ended) = (records(folder, "metrics")[0].time, records(folder, "end")[0].time)
+    assert (run.info.status, run.info.end_time) == ("FINISHED", ended)
+    assert began - 60_000 < run.info.start_time < ended
+
+
+@pytest.mark.usefixtures("no_mlflow")
+def test_one_process_delivers_at_a_time(tmp_path: Path, mlflow_file: str, monkeypatch, capsys):
+    Tracker(tmp_path, "an experiment", print).close("FINISHED")
+    one = Delivery(tmp_path, mlflow_file)
+    one.deliver()
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", mlflow_file)
+    with pytest.raises(BusyError, match="another process, the run itself or a flush, delivers its records"):
+        tracking_program(["flush", str(tmp_path)])
+    capsys.readouterr()
+    tracking_program(["status", str(tmp_path)])
+    assert "is delivering them" in capsys.readouterr().out
+    one.close()
+    tracking_program(["flush", str(tmp_path)])
+
+
+def test_what_holds_no_run_is_refused(tmp_path: Path, complaint):
+    assert f"RUN: got '{tmp_path}'; wanted a folder with a tracking.jsonl in it" in complaint(
+        tracking_program, "flush", str(tmp_path)
+    )
