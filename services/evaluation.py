@@ -184,7 +184,7 @@ def write_evaluation(evaluation: Evaluation, folder: Path) -> None:
 
 def _episode_rows(row: Mapping[str, object], trial: Trial, outcome: TrialOutcome) -> list[EpisodeResult]:
     return [
-        EpisodeResult.model_validate({**row, "episode": number, **episode._asdict()})
+        EpisodeResult.model_validate({**row, "episode": number, **episode.outcome})
         for number, episode in zip(trial.episodes, outcome.episodes, strict=True)
     ]
 
