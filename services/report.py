@@ -31,7 +31,11 @@ PANELS: Mapping[str, tuple[str, ...]] = {
     "agreement and usage entropy": ("agreement", "sub_skill_entropy"),
     "gradient norm": ("gradient_norm",),
 }
-KINDS = {"gallery": "services.gallery", "tables": "services.sweeps.layout"}
+KINDS = {
+    "gallery": "services.gallery",
+    "tables": "services.sweeps.layout",
+    "video": "services.reporting.video",
+}
 """What the program draws, and the module that does."""
 SMOOTHED = 50
 """A curve is drawn through so many means at most."""
