@@ -114,6 +114,20 @@ class DemoStore:
             raise self._damaged(path, f"arrays with the SHA-256 {found[:12]}, not the one in its metadata")
         return TaskDemonstrations(dataset_id, demonstrations, metadata.failed, found)
 
+    def seed_of(self, dataset_id: str, number: int) -> int:
+        """Return the seed of the attempt that a scripted expert's demonstration is, by its number in the data set.
+
+        Raises:
+            DemonstrationError: if the data set is damaged, or lies outside the root.
+        """
+        path = self.root / dataset_id
+        try:
+            check_listing(inside(self.root, dataset_id), DIGESTS, FILES)
+            with h5py.File(path / ARRAYS) as file:
+                return int(np.asarray(file[f"episode_{number}"].attrs["seed"]).item())
+        except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+            raise self._damaged(path, f"{type(error).__name__}: {error}") from error
+
     @staticmethod
     def _damaged(path: Path, got: str) -> DemonstrationError:
         return DemonstrationError(

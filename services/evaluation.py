@@ -251,7 +251,7 @@ def _finite(error: float | None) -> float | None:
 
 def _episode_rows(row: Mapping[str, object], trial: Trial, outcome: TrialOutcome) -> list[EpisodeResult]:
     return [
-        EpisodeResult.model_validate({**row, "episode": number, **episode._asdict()})
+        EpisodeResult.model_validate({**row, "episode": number, **episode.outcome})
         for number, episode in zip(trial.episodes, outcome.episodes, strict=True)
     ]
 

@@ -35,7 +35,8 @@ def figures_of(recent: Sequence[Mapping[str, float]]) -> Figures:
     if not recent:
         return Figures()
     told = [name for name in recent[-1] if "loss" in name or name.startswith("sub_skill_share/")]
-    means = {name: float(np.mean([metrics[name] for metrics in recent])) for name in told}
+    # A method that learns in phases tells other metrics in each.
+    means = {name: float(np.mean([metrics[name] for metrics in recent if name in metrics])) for name in told}
     losses = {name: value for name, value in means.items() if "loss" in name}
     return Figures(losses=losses, shares=shares_of(means).tolist())
 

@@ -22,6 +22,7 @@ KINDS = {
     "run": "services.reporting.run_report",
     "compare": "services.reporting.comparison",
     "sub-skills": "services.reporting.sub_skill_report",
+    "video": "services.reporting.video",
     "gallery": "services.gallery",
     "tables": "services.sweeps.layout",
 }

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from itertools import compress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -64,9 +64,24 @@ class Episode(NamedTuple):
     success: bool
     score: int
     """The best of the episode: sub-tasks done in suites that count them, else 1 for a success."""
-    steps: int
-    sub_skill_steps: list[int]
-    """How many steps each sub-skill acted, up to the highest one that did."""
+    sub_skills: list[int]
+    """The one that acted, at each step."""
+
+    @property
+    def steps(self) -> int:
+        """How many it lasted."""
+        return len(self.sub_skills)
+
+    @property
+    def sub_skill_steps(self) -> list[int]:
+        """How many steps each sub-skill acted, up to the highest one that did."""
+        return np.bincount(self.sub_skills).tolist()
+
+    @property
+    def outcome(self) -> dict[str, Any]:
+        """What a row of results says of it."""
+        told = self._asdict() | {"steps": self.steps, "sub_skill_steps": self.sub_skill_steps}
+        return {name: value for name, value in told.items() if name != "sub_skills"}
 
 
 def rollout(policy: Policy, envs: Sequence[Environment], seeds: Sequence[int], horizon: int) -> list[Episode]:
@@ -98,7 +113,7 @@ def rollout(policy: Policy, envs: Sequence[Environment], seeds: Sequence[int], h
         if not len(alive):
             break
     return [
-        Episode(seed, goal, bool(done), int(best), len(chosen), np.bincount(chosen).tolist())
+        Episode(seed, goal, bool(done), int(best), chosen)
         for seed, goal, done, best, chosen in zip(seeds, goals, success, score, choices, strict=True)
     ]
 

@@ -70,7 +70,7 @@ def heat_map(
         axis.invert_yaxis()
         axis.grid(visible=False)
         axis.spines[:].set_visible(False)
-        figure.colorbar(mesh, ax=axis, label=metric, fraction=0.05, pad=0.02)
+        figure.colorbar(mesh, ax=axis, label=metric, fraction=0.05, pad=0.02, ticks=[0, top], format="%g")
         return drawn(figure, title, _described(rows, tasks, values, digits))
 
 

@@ -48,7 +48,7 @@ def _figure(comparison: Comparison) -> Iterator[Figure]:
     columns = min(len(titles), 2)
     lines = -(-len(titles) // columns)
     rows = [row for row in comparison.rows if any(of.row == row for of in comparison.cells)]
-    height = 0.9 + 0.13 * max(4, len(rows) * (len(comparison.shots) + 1))
+    height = 1.2 + 0.13 * max(4, len(rows) * (len(comparison.shots) + 1))
     with panels(lines, columns, width=5.3 * columns, height=height * lines) as (figure, axes):
         for axis, title in zip(axes, titles, strict=False):
             _draw(axis, rows, [of for of in comparison.cells if _where(of) == title])

@@ -9,7 +9,7 @@ from jaxtyping import Float32, Float64
 
 from dmil_core.errors import UserError
 
-__all__ = ["Attempt", "Environment", "Expert", "SuiteError", "TaskSuite", "build_env"]
+__all__ = ["Attempt", "Environment", "Expert", "Measure", "SuiteError", "TaskSuite", "build_env", "measure_of"]
 
 Environment = gymnasium.Env[np.ndarray, np.ndarray]
 """A task's environment, with a flat observation and actions in a `Box`. ``reset(seed=n)`` twice gives the same episode
@@ -29,6 +29,15 @@ class Expert(Protocol):
     def get_action(self, obs: Float64[np.ndarray, " obs_dim"], /) -> Float32[np.ndarray, " action_dim"]:
         """Return what the expert does, before clipping to the action space."""
         ...
+
+
+class Measure(NamedTuple):
+    """A number that tells at each step how far an episode has come."""
+
+    name: str
+    """Of it in the infos of steps."""
+    words: str
+    """What it is, with its unit."""
 
 
 class Attempt(NamedTuple):
@@ -51,6 +60,8 @@ class TaskSuite(Protocol):
       sets that hold more, or another form;
     - ``replay(demonstration)``: what its actions lead to, in words;
     - ``camera``: what `services.suites.rendering.picture` looks through, if its environments are MuJoCo's;
+    - ``measure_of(task)``: a `Measure` of how far an episode has come, or None; of suites with scores it is the score;
+    - ``make_measured_env(task)``: as ``make_env``, but its infos hold the measure, where those of ``make_env`` do not;
     - ``expert_tasks``: the tasks whose experts are verified, where those are not the tasks of both splits.
     """
 
@@ -83,13 +94,25 @@ class SuiteError(UserError):
     """A package's suite that cannot be used."""
 
 
-def build_env(suite: TaskSuite, task: str) -> Environment:
+def measure_of(suite: TaskSuite, task: str) -> Measure | None:
+    """Return what tells how far an episode of a task has come, if the suite names anything."""
+    if hasattr(suite, "measure_of"):
+        return suite.measure_of(task)  # type: ignore[attr-defined]
+    return Measure("score", "sub-tasks done") if suite.best_score > 1 else None
+
+
+def build_env(suite: TaskSuite, task: str, *, measured: bool = False) -> Environment:
     """Build a task's environment, and check its spaces.
+
+    Args:
+        suite: of the task.
+        task: one of the suite's.
+        measured: whether the infos of its steps must hold what `measure_of` names.
 
     Raises:
         SuiteError: if they are not those that the suite names.
     """
-    env = suite.make_env(task)
+    env = getattr(suite, "make_measured_env", suite.make_env)(task) if measured else suite.make_env(task)
     for field, space, size in (
         ("observation_space", env.observation_space, suite.obs_dim),
         ("action_space", env.action_space, suite.action_dim),

@@ -11,7 +11,7 @@ from metaworld.policies import ENV_POLICY_MAP
 
 from dmil_core.configs import SuiteConfig
 from dmil_core.errors import UserError
-from services.suites.base import Environment, Expert
+from services.suites.base import Environment, Expert, Measure
 from services.suites.metaworld_speed import fast_environment
 from services.suites.push_around_wall import PushAroundWallEnv, PushAroundWallExpert
 from services.suites.rendering import View
@@ -56,6 +56,9 @@ ml10 and ml45 are the benchmark's own splits, ml10-reference is that of the auth
 benchmark's. An ML1 has one task in both; as each episode and demonstration has a goal of its own, those of meta-testing
 are unseen in meta-training.
 """
+
+WITHOUT_DISTANCE = {"assembly", "box-close", "disassemble", "door-open", "hammer", "lever-pull"}
+"""Tasks whose info has a zero for the distance to the goal, or, in lever-pull, the distance from hand to lever."""
 
 
 warnings.filterwarnings("ignore", message=r"Constant\(s\) may be too high")  # whoever acts clips the actions
@@ -145,6 +148,16 @@ class MetaWorldSuite:
         self._goal_visible = config.goal_visible
         rule = f"goal {'visible' if config.goal_visible else 'hidden'}; success at any step within {self.horizon}"
         self.protocol = rule if config.protocol == "paper" else f"Meta-World's evaluation; {rule}"
+
+    def make_measured_env(self, task: str) -> Environment:
+        """Build the same with rewards, whose terms are in the infos."""
+        return self.make_env(task, rewards=True)
+
+    def measure_of(self, task: str) -> Measure:
+        """Return the distance to the goal, or Meta-World's reward for the tasks that compute no such distance."""
+        if task in WITHOUT_DISTANCE:
+            return Measure("unscaled_reward", "Meta-World's reward, 0 to 10")
+        return Measure("obj_to_target", "distance to the goal (m)")
 
     def make_env(self, task: str, *, rewards: bool = False) -> Environment:
         """Build a task's environment, made fast; unless asked for, its rewards are NaN and its info is ``success``."""

@@ -1,9 +1,8 @@
 """Pictures of MuJoCo environments, drawn without a screen."""
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib import import_module
+from types import TracebackType
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -13,7 +12,7 @@ from jaxtyping import UInt8
 
 from dmil_core.errors import UserError
 
-__all__ = ["RenderingError", "View", "picture", "working_backend"]
+__all__ = ["Camera", "RenderingError", "View", "picture", "working_backend"]
 
 mujoco: Any = compiled_mujoco  # compiled, so a type checker sees nothing of it
 
@@ -38,48 +37,95 @@ class View(NamedTuple):
     """In degrees above the horizon; below 0 it looks down."""
 
 
-def picture(
-    env: gymnasium.Env[Any, Any], camera: str | View, height: int = 360, width: int = 480
-) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw what a camera sees now, in red, green and blue; where it hangs upside down, the picture is turned upright.
+class Camera:
+    """Draws what happens in one environment, picture after picture; to be used in a ``with``.
 
-    Args:
-        env: has MuJoCo's ``model`` and ``data`` in it, and stays as it is.
-        camera: one that the model names, in Meta-World for example corner2, or one of one's own.
-        height: in pixels.
-        width: in pixels.
-
-    Raises:
-        RenderingError: if the model has no such camera, or OpenGL does not work here.
+    What is costly, to bring the model's meshes and textures to OpenGL, is done once.
     """
-    unwrapped: Any = env.unwrapped
-    model, data = unwrapped.model, unwrapped.data
-    view = _camera(model, camera)
-    scene, frame = mujoco.MjvScene(model, maxgeom=10_000), mujoco.MjrRect(0, 0, width, height)
-    pixels = np.empty((height, width, 3), np.uint8)
-    with _drawing(model, height, width) as context:
-        mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, view, mujoco.mjtCatBit.mjCAT_ALL, scene)
-        mujoco.mjr_render(frame, scene, context)
-        mujoco.mjr_readPixels(pixels, None, frame, context)
-    upright = view.fixedcamid < 0 or data.cam_xmat[view.fixedcamid].reshape(3, 3)[2, 1] >= 0
-    return (pixels[::-1] if upright else pixels[:, ::-1]).copy()  # OpenGL's first row is the lowest
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        view: str | View,
+        height: int = 360,
+        width: int = 480,
+        *,
+        shadows: bool = True,
+    ) -> None:
+        """Look at an environment.
+
+        Args:
+            env: has MuJoCo's ``model`` and ``data`` in it, and stays as it is.
+            view: one that the model names, in Meta-World for example corner2, or one of one's own.
+            height: of the pictures, in pixels.
+            width: of the pictures.
+            shadows: without them a picture takes a third to an eighth of the time.
+
+        Raises:
+            RenderingError: if the model has no such camera, or OpenGL does not work here.
+        """
+        self._env: Any = env.unwrapped
+        model = self._env.model
+        self._view = _looking(model, view)
+        self._scene, self._frame = mujoco.MjvScene(model, maxgeom=10_000), mujoco.MjrRect(0, 0, width, height)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+        self._surface = _surface(height, width)
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        mujoco.mjr_resizeOffscreen(width, height, self._context)
+
+    def picture(self) -> UInt8[np.ndarray, "height width 3"]:
+        """Draw what it sees now, in red, green and blue; where it hangs upside down, the picture is turned upright."""
+        model, data = self._env.model, self._env.data
+        pixels = np.empty((self._frame.height, self._frame.width, 3), np.uint8)
+        self._surface.make_current()
+        every = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, self._view, every, self._scene)
+        mujoco.mjr_render(self._frame, self._scene, self._context)
+        mujoco.mjr_readPixels(pixels, None, self._frame, self._context)
+        number = self._view.fixedcamid
+        upright = number < 0 or data.cam_xmat[number].reshape(3, 3)[2, 1] >= 0
+        return (pixels[::-1] if upright else pixels[:, ::-1]).copy()  # OpenGL's first row is the lowest
+
+    def __enter__(self) -> "Camera":
+        """Draw."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """See `close`."""
+        self.close()
+
+    def close(self) -> None:
+        """Give back what OpenGL holds."""
+        self._surface.make_current()
+        self._context.free()
+        self._surface.free()
 
 
-def _camera(model: Any, camera: str | View) -> Any:
-    view = mujoco.MjvCamera()
-    if isinstance(camera, View):
-        view.lookat[:], view.distance, view.azimuth, view.elevation = camera
-        return view
+def picture(
+    env: gymnasium.Env[Any, Any], view: str | View, height: int = 360, width: int = 480
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw a single picture, see `Camera`."""
+    with Camera(env, view, height, width) as camera:
+        return camera.picture()
+
+
+def _looking(model: Any, view: str | View) -> Any:
+    looking = mujoco.MjvCamera()
+    if isinstance(view, View):
+        looking.lookat[:], looking.distance, looking.azimuth, looking.elevation = view
+        return looking
     cameras = [model.camera(index).name for index in range(model.ncam)]
-    if camera not in cameras:
-        raise RenderingError(f"camera: got {camera}; wanted one of {', '.join(cameras)}")
-    view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, cameras.index(camera)
-    return view
+    if view not in cameras:
+        raise RenderingError(f"camera: got {view}; wanted one of {', '.join(cameras)}")
+    looking.type, looking.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, cameras.index(view)
+    return looking
 
 
-@contextmanager
-def _drawing(model: Any, height: int, width: int) -> Iterator[Any]:
-    """Give what MuJoCo draws with, off the screen.
+def _surface(height: int, width: int) -> Any:
+    """Return what OpenGL draws on off the screen, and draw on it from now on.
 
     The backend is loaded here and not, as ``mujoco.Renderer`` does, with MuJoCo itself: a machine without it can
     simulate all the same.
@@ -97,14 +143,7 @@ def _drawing(model: Any, height: int, width: int) -> Iterator[Any]:
             f"MUJOCO_GL: got {backend}, which does not work here ({type(error).__name__}: {error}); "
             f"wanted a backend of OpenGL that needs no screen: {', or '.join(ways)}"
         ) from error
-    context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-    try:
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
-        mujoco.mjr_resizeOffscreen(width, height, context)
-        yield context
-    finally:
-        context.free()
-        surface.free()
+    return surface
 
 
 def working_backend() -> str:
@@ -113,5 +152,5 @@ def working_backend() -> str:
     Raises:
         RenderingError: if there is none.
     """
-    with _drawing(mujoco.MjModel.from_xml_string("<mujoco/>"), height=16, width=16):
-        return os.environ.get("MUJOCO_GL") or "egl"
+    _surface(height=16, width=16).free()
+    return os.environ.get("MUJOCO_GL") or "egl"

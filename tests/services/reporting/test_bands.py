@@ -60,7 +60,7 @@ def test_a_panel_for_each_metric_and_one_legend_for_all() -> None:
     assert colour_of(0) not in found.svg
 
 
-@pytest.mark.parametrize(("values", "ticks"), [([1, 0.001], "0.01"), ([1, -1], "0.00")])
+@pytest.mark.parametrize(("values", "ticks"), [([1, 0.001], "0.01"), ([1, -1], "0.0")])
 def test_a_loss_that_falls_far_is_drawn_by_its_logarithm(values: list[float], ticks: str) -> None:
     found = curves("Losses", {"DMIL": [seed(values)]}, {"loss": "loss"})
     assert found is not None

@@ -1,0 +1,148 @@
+"""Film one episode of a finished run, as it was evaluated: which sub-skill acts at each step, and whether it succeeds.
+
+The episode is run again from its row of results. With --demonstration, one that was adapted to is shown beside it.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from dmil_core.errors import UserError, shown
+from dmil_core.settings import sub_skills_of
+from services.command_line import ConfigError, exit_code, parse
+from services.progress import console
+from services.reporting.film import FORMS, Form, FormName, Side, film_of, write_film
+from services.reporting.finished import FinishedRun
+from services.reporting.replay import Replay, Seen, replaying
+from services.results import EpisodeResult
+from services.suites.rendering import View
+
+__all__ = ["Arguments", "CameraError", "camera_of", "command", "run", "side_of"]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Arguments of ``report video``."""
+
+    run: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN")]
+    """Name or folder of a finished run."""
+    task: str
+    """One of the run's tasks."""
+    shots: int = 1
+    """Demonstrations adapted to, as in the run's evaluation."""
+    episode: int | None = None
+    """Number of the episode, the first if not given."""
+    format: FormName = "mp4"
+    """mp4, which all browsers play, or gif."""
+    output: Path | None = None
+    """File to write, in the run's folder report/videos if not given."""
+    demonstration: bool = False
+    """Show beside it the first demonstration of its support set, which the expert gives once more from its seed."""
+    runs: Path = Path("runs")
+    """The folder that runs are in."""
+
+
+class CameraError(UserError):
+    """A suite of whose tasks nothing can be drawn."""
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run the program."""
+    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, tyro.MISSING))
+    finished = FinishedRun.found(given.run, given.runs)
+    row = _row_of(finished, given)
+    path = given.output or finished.folder / "report" / "videos" / f"{name_of(row)}.{given.format}"
+    if path.suffix != f".{given.format}":
+        raise ConfigError(f"--output: got {path}; wanted a name that ends in .{given.format}, or another --format")
+    with replaying(finished) as replay:
+        sides, seen = _sides(replay, row, FORMS[given.format], demonstration=given.demonstration)
+    if seen.difference is not None:
+        console.print(f"warning: {seen.difference}; the film shows what came of it here", markup=False)
+    write_film(path, sides)
+    console.print(f"{sides[-1].title}: {sides[-1].ending}", markup=False)
+    console.print(f"{path}, {path.stat().st_size // 1024} KB", markup=False)
+
+
+def _row_of(finished: FinishedRun, given: Arguments) -> EpisodeResult:
+    """Return the row of the episode that is asked for.
+
+    Raises:
+        ConfigError: if the run has none, with those that it has.
+    """
+    rows = finished.episodes
+    tasks = dict.fromkeys(row.task for row in rows)
+    if given.task not in tasks:
+        raise ConfigError(f"--task: got {shown(given.task)}; wanted one of {finished.name}'s: {', '.join(tasks)}")
+    rows = [row for row in rows if row.task == given.task]
+    shots = sorted({row.shots for row in rows})
+    if given.shots not in shots:
+        raise ConfigError(
+            f"--shots: got {given.shots}; {finished.name} was evaluated with {', '.join(map(str, shots))}; wanted one "
+            "of these, or a run with others: --evaluation.shots"
+        )
+    by_number = {row.episode: row for row in rows if row.shots == given.shots}
+    number = min(by_number) if given.episode is None else given.episode
+    if number not in by_number:
+        raise ConfigError(f"--episode: got {number}; wanted one from {min(by_number)} to {max(by_number)}")
+    return by_number[number]
+
+
+def name_of(row: EpisodeResult) -> str:
+    """Return what a file about an episode is named."""
+    return f"{row.task}-{row.shots}-shot-episode-{row.episode}"
+
+
+def command(finished: FinishedRun, row: EpisodeResult) -> str:
+    """Return the command line that films an episode."""
+    return (
+        f"python -m services.report video {finished.folder} --task {row.task} --shots {row.shots} "
+        f"--episode {row.episode}"
+    )
+
+
+def camera_of(finished: FinishedRun) -> str | View:
+    """Return the camera of a run's suite.
+
+    Raises:
+        CameraError: if it names none.
+    """
+    suite = finished.experiment.suite
+    camera: str | View | None = getattr(suite, "camera", None)
+    if camera is None:
+        raise CameraError(
+            f"suite: got {suite.name}, which names no camera; wanted one whose tasks can be drawn; give it a camera if "
+            "its environments are MuJoCo's: docs/your-own-task.md"
+        )
+    return camera
+
+
+def _sides(replay: Replay, row: EpisodeResult, form: Form, *, demonstration: bool) -> tuple[list[Side], Seen]:
+    """Return what the film shows from left to right, and the episode that it is about."""
+    camera = camera_of(replay.run)
+    film = film_of(camera, row.steps, form)
+    sides = []
+    if demonstration:
+        shown_first, footage = replay.demonstration(row, film)
+        steps = len(footage.actions)
+        title = f"demonstration {shown_first.id} of {row.task}"
+        sides.append(Side(title, footage.frames, steps, None, True, f"demonstrated in {steps} steps"))
+    (seen,) = [seen for seen in replay.trial(row, film, [row.episode]) if seen.row.episode == row.episode]
+    return [*sides, side_of(replay.run, seen)], seen
+
+
+def side_of(finished: FinishedRun, seen: Seen) -> Side:
+    """Return an episode as a film shows it."""
+    episode, row = seen.watched.episode, seen.row
+    title = f"{row.task}, {row.shots}-shot, episode {row.episode}"
+    score = f": {episode.score} of {best} sub-tasks" if (best := finished.experiment.suite.best_score) > 1 else ""
+    ending = f"{'solved' if episode.success else 'not solved'} in {episode.steps} steps{score}"
+    sub_skills = episode.sub_skills if sub_skills_of(finished.config.method) > 1 else None
+    return Side(title, seen.footage.frames, episode.steps, sub_skills, episode.success, ending)
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code(run, sys.argv[1:]))
