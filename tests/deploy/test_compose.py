@@ -15,7 +15,7 @@ OTHERS = {"postgres": {5432}, "grafana": {3000}}
 """Ports of programs that need not be told."""
 WITHOUT_A_USER_OF_THEIR_IMAGE = {"prometheus", "grafana"}
 """Images of others, which name one that is not root."""
-ADDRESS = re.compile(r"(?:https?|postgresql)://(?:\w+@)?([a-z][\w.-]*|127\.0\.0\.1):(\d+)")
+ADDRESS = re.compile(r"(?:https?|postgresql\+psycopg2)://(?:\w+@)?([a-z][\w.-]*|127\.0\.0\.1):(\d+)")
 
 
 def services() -> dict[str, dict[str, Any]]:

@@ -221,7 +221,7 @@ def test_what_is_called_is_a_service(name: str):
     services = of_kind("Service", name)
     for container in containers(list(overlay(name))):
         for text in [*container.environment.values(), *container.command]:
-            for host, port in re.findall(r"(?:http|postgresql)://(?:\w+@)?([\w-]+):(\d+)", text):
+            for host, port in re.findall(r"(?:http|postgresql\+psycopg2)://(?:\w+@)?([\w-]+):(\d+)", text):
                 assert int(port) in {entry["port"] for entry in services[host]["spec"]["ports"]}, text
 
 
