@@ -28,7 +28,9 @@ def scraped(port: int) -> Series:
         lines = answer.read().decode().splitlines()
     found = {}
     for name, labels, value in (line.groups() for line in map(LINE.fullmatch, lines) if line):
-        own = {(key, text) for key, text in re.findall(r'(\w+)="([^"]*)"', labels) if key.islower() and "otel" not in key}
+        own = {
+            (key, text) for key, text in re.findall(r'(\w+)="([^"]*)"', labels) if key.islower() and "otel" not in key
+        }
         found[name, frozenset(own)] = float(value)
     return found
 
