@@ -120,9 +120,14 @@ def test_where_there_is_no_terminal_there_are_lines(train, capsys: pytest.Captur
 def test_an_error_takes_the_screen_away(terminal: Terminal, monkeypatch: pytest.MonkeyPatch):
     with open(terminal.program, "w") as file:  # noqa: PTH123  a descriptor
         monkeypatch.setattr("services.progress.console", Output(file=file, force_terminal=True, highlight=False))
-        with pytest.raises(ArithmeticError), Bar("working", 10, unit="pieces") as bar:
-            bar.advance(3, "the third")
-            raise ArithmeticError
+
+        def work() -> None:
+            with Bar("working", 10, unit="pieces") as bar:
+                bar.advance(3, "the third")
+                raise ArithmeticError
+
+        with pytest.raises(ArithmeticError):
+            work()
         sent = terminal.read(lambda sent: "working 3/10" in sent.rpartition(SHOWN)[2])
     assert HIDDEN in sent
     assert "0/10" in sent.partition(SHOWN)[0]
