@@ -117,17 +117,17 @@ def test_where_there_is_no_terminal_there_are_lines(train, capsys: pytest.Captur
     assert "\x1b" not in printed
 
 
+def fail_at_the_third() -> None:
+    with Bar("working", 10, unit="pieces") as bar:
+        bar.advance(3, "the third")
+        raise ArithmeticError
+
+
 def test_an_error_takes_the_screen_away(terminal: Terminal, monkeypatch: pytest.MonkeyPatch):
     with open(terminal.program, "w") as file:  # noqa: PTH123  a descriptor
         monkeypatch.setattr("services.progress.console", Output(file=file, force_terminal=True, highlight=False))
-
-        def work() -> None:
-            with Bar("working", 10, unit="pieces") as bar:
-                bar.advance(3, "the third")
-                raise ArithmeticError
-
         with pytest.raises(ArithmeticError):
-            work()
+            fail_at_the_third()
         sent = terminal.read(lambda sent: "working 3/10" in sent.rpartition(SHOWN)[2])
     assert HIDDEN in sent
     assert "0/10" in sent.partition(SHOWN)[0]

@@ -84,7 +84,8 @@ def test_a_strip_is_as_wide_as_there_is_room(shares: tuple[float, ...]):
 def test_a_line_says_it_in_words():
     assert FIGURES.in_words == (
         "loss 0.610; sub-skills in use 3/3; after 500; meta-training 1-shot 0.750 (45/60); "
-        "meta-training 3-shot 0.833 (50/60); meta-testing 1-shot 0.500 (10/20); workers restarted 1; door-close"
+        "meta-training 3-shot 0.833 (50/60); "
+        "meta-testing 1-shot 0.500 (10/20); workers restarted 1; door-close"
     )
     assert Figures(losses={"loss": float("nan")}, shares=[1.0]).in_words == "loss nan"
     assert PACE.in_words == "4 iterations/s, 0:03:20 so far, 0:05:12 left"
