@@ -1,6 +1,6 @@
 """Methods by name: our own, and those that installed packages bring."""
 
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from typing import Any
 
 from dmil_core.errors import UserError, shown
@@ -75,9 +75,12 @@ def config_type(name: object) -> type[MethodConfig]:
     return method_type(name).config_type
 
 
-def _registered() -> dict[str, EntryPoint]:
-    """Return the methods of installed packages by name."""
-    found: dict[str, EntryPoint] = {}
+def _registered() -> dict[str, Any]:
+    """Return the entry points of installed packages' methods by name.
+
+    Their class is this Python's, or that of the backport ``importlib_metadata`` where somebody has imported that.
+    """
+    found: dict[str, Any] = {}
     for point in entry_points(group=ENTRY_POINTS):
         if (ours := OURS.get(point.name)) is not None:
             raise MethodError(
@@ -92,7 +95,7 @@ def _registered() -> dict[str, EntryPoint]:
     return found
 
 
-def _loaded(point: EntryPoint) -> type[Standardised[Any]]:
+def _loaded(point: Any) -> type[Standardised[Any]]:
     """Import the class that a package registers."""
     where = f"method.name: got {point.name}, {point.value}"
     try:
