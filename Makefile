@@ -37,8 +37,8 @@ test: setup ## lint, format, types, then every test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
-	$(BIN)/python -m pytest -m "not alone and not deploy" -n 2 --dist loadfile --durations 10
-	$(BIN)/python -m pytest -m alone --durations 20
+	$(BIN)/python -m pytest --ignore tests/deploy -m "not alone" -n 2 --dist loadfile --durations 10
+	$(BIN)/python -m pytest --ignore tests/deploy -m alone --durations 20
 
 check-deploy: setup ## hold everything in deploy/ against schemas, checkers and the project itself; no container engine
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,deploy]'
