@@ -27,7 +27,6 @@ from services.progress import Clock, console
 from services.replica import replicated, restored
 from services.report import PAGE, publish, show, write_report
 from services.reporting.finished import FinishedRun
-from services.reporting.run_report import write_run_page
 from services.storage import STORAGE
 from services.summary import summarise
 from services.tracking import Tracker, introduce
@@ -114,6 +113,8 @@ def _carry_out(given: Arguments, folder: Path, checkpoint: Checkpoint | None) ->
             clock.lap("evaluate")
         summary = summarise(evaluation, seconds=clock.seconds, folder=folder, mlflow_run_id=tracker.run_id)
         write_report(summary, folder)
+        from services.reporting.run_report import write_run_page  # takes seconds to import: not for --help
+
         write_run_page(FinishedRun(folder), folder / "report" / PAGE)
         publish(tracker, summary, folder)
         status = "FINISHED"

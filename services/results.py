@@ -1,6 +1,8 @@
 """Rows of results: one an episode, one an adaptation, with all that is needed to run them again."""
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -12,6 +14,7 @@ from services.disk import read_file, write_file
 __all__ = [
     "AdaptationResult",
     "EpisodeResult",
+    "EvaluationFolder",
     "ImitationResult",
     "RowError",
     "Split",
@@ -135,3 +138,20 @@ def read_lines(path: Path) -> Iterator[tuple[int, bytes]]:
             yield number, line
         elif line:
             raise RowError(f"{path}:{number}: got half a line; wanted a whole one; remove it or make the file again")
+
+
+@dataclass(frozen=True)
+class EvaluationFolder:
+    """A folder with the rows of an evaluation; each file is read when it is asked for, once."""
+
+    folder: Path
+
+    @cached_property
+    def episodes(self) -> list[EpisodeResult]:
+        """A row an episode."""
+        return read_rows(self.folder / "episodes.jsonl", EpisodeResult)
+
+    @cached_property
+    def adaptations(self) -> list[AdaptationResult]:
+        """A row an adaptation."""
+        return read_rows(self.folder / "adaptations.jsonl", AdaptationResult)

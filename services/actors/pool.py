@@ -2,9 +2,7 @@
 
 import bisect
 import time
-from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from statistics import median
 from typing import Any
 
 import ray
@@ -13,6 +11,7 @@ from ray.exceptions import ObjectLostError, RayActorError, RayError, RayTaskErro
 from dmil_core.errors import RunError
 from services.actors.calls import Call, Worker, now
 from services.actors.faults import DeadlyCallError, LostError, NoRoomError
+from services.actors.patience import SLOWNESS, Patience
 from services.actors.witness import Witness
 
 __all__ = ["Pool"]
@@ -20,16 +19,6 @@ __all__ = ["Pool"]
 PLACEMENT_SECONDS = 120
 DEATHS_ALLOWED = 3
 """A call in whose course so many actors ended is suspected to end them."""
-SLOWNESS = 10
-"""A call that takes so many times what its like take is also given to another actor."""
-LEAST_SECONDS = 2.0
-"""But not before: a spare actor takes some seconds to start."""
-FIRST_SECONDS = 60.0
-"""What a call may take before it is known what its like take."""
-OWN_SECONDS = 30.0
-"""Nor before that where the actor is one of one's own: to lose it costs more."""
-PEERS = 3
-"""Calls of one method that must have ended for it to be known what its like take; the last hundred count."""
 WATCH_SECONDS = 0.5
 
 
@@ -67,7 +56,7 @@ class Pool:
         self._starting: dict[ray.ObjectRef, Worker] = {}
         self._waiting: list[Call] = []
         self._running: dict[ray.ObjectRef, Call] = {}
-        self._seconds: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=100))
+        self._patience = Patience()
         self._submitted = self._failed_starts = 0
         self._manned = time.monotonic()
         """When an actor was last seen to be up."""
@@ -296,7 +285,7 @@ class Pool:
             self._replace(call.worker)
         self._let_spare_go(call)
         if call.began is not None:
-            self._seconds[call.method].append(time.monotonic() - call.began)
+            self._patience.took(call, time.monotonic() - call.began)
         self._take_from_worker(call)
         call.value, call.done = value, True
         call.arguments, call.beside = (), None  # what it was built upon may go
@@ -353,15 +342,11 @@ class Pool:
         for call in (*first, *own):
             if call.began is None and all(part.done for part in call.built_upon):
                 call.began = now
-            elif call.began is not None and call.spare is None and now - call.began > self._patience(call):
+            elif call.began is not None and call.spare is None and now - call.began > self._patience.with_call(call):
                 self._rescue(call, now - call.began)
             elif call.spare is not None and not call.twin and call.spare.up:
                 self._witness.again(call)
                 call.twin = self._send(call, call.spare.actor)
-
-    def _patience(self, call: Call) -> float:
-        known, least = self._seconds[call.method], LEAST_SECONDS if call.on is None else OWN_SECONDS
-        return max(least, SLOWNESS * median(known)) if len(known) >= PEERS else FIRST_SECONDS
 
     def _rescue(self, call: Call, seconds: float) -> None:
         if call.on is not None:

@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 from matplotlib.lines import Line2D
-from sklearn.manifold import TSNE
 
 from dmil_core.demonstrations import Demonstration, Standardisation
 from dmil_core.settings import sub_skills_of
@@ -64,6 +63,8 @@ def embed(states: Float[np.ndarray, "states obs_dim"], perplexity: float, seed: 
         perplexity: about how many neighbours count as near; less than the number of states.
         seed: of what is random in it.
     """
+    from sklearn.manifold import TSNE  # takes a second to import: not for each program that can draw
+
     tsne = TSNE(perplexity=perplexity, init="pca", learning_rate="auto", random_state=seed, n_jobs=1)
     return tsne.fit_transform(states).astype(np.float32)
 

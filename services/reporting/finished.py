@@ -14,7 +14,7 @@ from services.disk import read_file
 from services.experiment import Experiment
 from services.folders import FolderError, find_folder
 from services.reporting.records import Origin, read_metrics, read_origin
-from services.results import AdaptationResult, EpisodeResult, read_rows
+from services.results import EpisodeResult, EvaluationFolder, read_rows
 from services.runners import LocalRunner
 from services.summary import Summary
 
@@ -31,10 +31,8 @@ class UnfinishedError(UserError):
 
 
 @dataclass(frozen=True)
-class FinishedRun:
+class FinishedRun(EvaluationFolder):
     """What ``meta_train`` left behind; each file is read when it is asked for, once."""
-
-    folder: Path
 
     @staticmethod
     def found(name: str, runs: Path) -> "FinishedRun":
@@ -95,16 +93,6 @@ class FinishedRun:
     def config(self) -> ExperimentConfig:
         """All settings."""
         return self.checkpoint.manifest.config
-
-    @cached_property
-    def episodes(self) -> list[EpisodeResult]:
-        """A row an episode."""
-        return read_rows(self.folder / "episodes.jsonl", EpisodeResult)
-
-    @cached_property
-    def adaptations(self) -> list[AdaptationResult]:
-        """A row an adaptation."""
-        return read_rows(self.folder / "adaptations.jsonl", AdaptationResult)
 
     @cached_property
     def metrics(self) -> list[dict[str, float]]:

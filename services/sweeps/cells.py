@@ -24,7 +24,7 @@ from dmil_core.seeding import stream
 from dmil_core.statistics import Interval, interquartile_mean, mean_score, stratified_bootstrap, success_rate
 from services.published import Published
 from services.reporting.records import read_metrics
-from services.results import AdaptationResult, EpisodeResult, Split, read_rows
+from services.results import EpisodeResult, EvaluationFolder, Split
 from services.summary import sub_skill_use
 from services.sweeps.settings import Metric
 
@@ -65,7 +65,7 @@ Outcomes = Mapping[int, Tried]
 
 
 @dataclass(frozen=True)
-class Contender:
+class Contender(EvaluationFolder):
     """One seed of a row on a suite: a configuration that was trained, and an evaluation of it."""
 
     row: str
@@ -78,18 +78,6 @@ class Contender:
     """That meta-training took."""
     home: Path
     """Folder of what was measured on the way, ``tracking.jsonl``."""
-    folder: Path
-    """Of the evaluation's rows."""
-
-    @cached_property
-    def episodes(self) -> list[EpisodeResult]:
-        """A row an episode."""
-        return read_rows(self.folder / "episodes.jsonl", EpisodeResult)
-
-    @cached_property
-    def adaptations(self) -> list[AdaptationResult]:
-        """A row an adaptation."""
-        return read_rows(self.folder / "adaptations.jsonl", AdaptationResult)
 
     @cached_property
     def metrics(self) -> list[dict[str, float]]:

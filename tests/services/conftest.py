@@ -1,7 +1,5 @@
 """What the tests of the service share: one small store of demonstrations, one Ray cluster, and the programs."""
 
-import os
-import secrets
 import shutil
 import signal
 import socket
@@ -24,27 +22,8 @@ from services.command_line import exit_code
 from services.demo_store import DemoStore, TaskDemonstrations
 from services.experiment import Experiment, open_runner
 
-# Ray reads these when it is first imported, after this file, here and in every program that a test starts.
-os.environ |= {
-    "RAY_AUTH_MODE": "token",
-    "RAY_AUTH_TOKEN": secrets.token_hex(32),
-    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
-    "RAY_USAGE_STATS_ENABLED": "0",
-    "MLFLOW_DISABLE_TELEMETRY": "true",
-    "OMP_NUM_THREADS": "1",
-}
-for _name in ("RAY_ADDRESS", "MLFLOW_TRACKING_URI", "MLFLOW_RUN_ID", "MLFLOW_EXPERIMENT_NAME", "DMIL_DATA"):
-    os.environ.pop(_name, None)
-
 PROJECT = Path(__file__).parents[2]
 SECONDS_TO_START = 90
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what works on the session's cluster: there is one, with workers for every core."""
-    for item in items:
-        if "cluster" in getattr(item, "fixturenames", ()):
-            item.add_marker(pytest.mark.alone)
 
 
 @pytest.fixture(scope="session")

@@ -45,8 +45,8 @@ def small(config: ExperimentConfig, store: DemoStore) -> Experiment:
 @pytest.mark.usefixtures("joined")
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_lost_learner_changes_nothing(small: Experiment, data, how: int, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("services.actors.pool.OWN_SECONDS", 2.0)
-    monkeypatch.setattr("services.actors.pool.FIRST_SECONDS", 20.0)
+    monkeypatch.setattr("services.actors.patience.OWN_SECONDS", 2.0)
+    monkeypatch.setattr("services.actors.patience.FIRST_SECONDS", 20.0)
     wanted = alone(small, data)
     with open_runner("ray", small.suite, 2) as runner:
         meta_training = runner.meta_train(plan_of(small, data))
@@ -85,7 +85,7 @@ def test_what_was_done_since_the_last_state_is_done_again(small: Experiment, dat
 def test_a_hung_worker_is_overtaken_and_the_log_says_so(
     small: Experiment, data, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    monkeypatch.setattr("services.actors.pool.LEAST_SECONDS", 0.5)
+    monkeypatch.setattr("services.actors.patience.LEAST_SECONDS", 0.5)
     wanted = alone(small, data)
     with open_runner("ray", small.suite, 2) as runner:
         meta_training = runner.meta_train(plan_of(small, data))

@@ -13,6 +13,8 @@ import pytest
 from services.checkpoints import Checkpoints
 
 PROJECT = Path(__file__).parents[2]
+pytestmark = pytest.mark.alone  # Ray gives a stopped job three seconds
+
 JOB = [sys.executable, "-m", "ray.scripts.scripts", "job"]
 
 

@@ -218,7 +218,8 @@ def test_a_stopped_run_goes_on_with_the_same_bits(
     assert "Traceback" not in printed
     monkeypatch.delenv("DMIL_TEST_SESSION")
     wait_for(lambda: not descendants(session), f"the end of {descendants(session)}", 15)
-    assert set(Path("/dev/shm").iterdir()) <= shared
+    if runner == "ray":
+        assert set(Path("/dev/shm").iterdir()) <= shared
 
     stopped = checkpoints.newest()
     mlflow_run = json.loads((workplace / "runs" / "run" / "mlflow_run.json").read_text())["run_id"]

@@ -241,7 +241,6 @@ EXAMPLE = PROJECT / "docs" / "examples" / "reptile"
 
 
 @pytest.mark.slow
-@pytest.mark.alone
 def test_an_installed_method_is_meta_trained_to_its_table(programs, workplace: Path, monkeypatch: pytest.MonkeyPatch):
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
     source = workplace / "source"

@@ -13,7 +13,7 @@ import pytest
 import ray
 
 from services.actors.adaptation import AdaptationWorker
-from services.metrics import MEASURES, Meter
+from services.metrics import MEASURES, Meter, RayMeter
 from services.runners import LocalRunner
 
 PROJECT = Path(__file__).parents[2]
@@ -35,8 +35,12 @@ def scraped(port: int) -> Series:
     return found
 
 
+SUITE = "of this test"
+"""Its label: Ray goes on counting, in one process, from cluster to cluster."""
+
+
 def key(name: str, **labels: str) -> tuple[str, frozenset[tuple[str, str]]]:
-    return f"ray_{name}", frozenset({"suite": "ml10-part", **labels}.items())
+    return f"ray_{name}", frozenset({"suite": SUITE, **labels}.items())
 
 
 @pytest.fixture
@@ -63,6 +67,7 @@ def test_a_run_with_a_killed_worker_arrives(
             return super().gradient(parameters, iteration, tasks, block, before)
 
     monkeypatch.setattr("services.ray_meta_training.AdaptationWorker", Mortal)
+    monkeypatch.setattr("services.ray_runner.RayMeter", lambda suite: RayMeter(SUITE))
     arguments = ["--workers", "2", "--training.tasks-per-iteration", "5", "--training.slots-per-group", "1"]
     train("run", "--runner", "ray", "--training.iterations", "6", *arguments)
 

@@ -16,6 +16,8 @@ from services.actors.calls import Worker
 from services.actors.faults import DeadlyCallError, LostError
 from services.actors.pool import DEATHS_ALLOWED, Pool
 
+pytestmark = pytest.mark.alone  # some are to be overtaken for their slowness, the others not
+
 
 @pytest.fixture
 def make(joined) -> Iterator:
@@ -143,7 +145,7 @@ def test_calls_that_wait_behind_a_deadly_one_are_not_suspected(make, tmp_path: P
 
 def test_a_hung_actor_is_overtaken(make, monkeypatch: pytest.MonkeyPatch):
     """Both where others wait for what it makes, and where it is the only one."""
-    monkeypatch.setattr("services.actors.pool.LEAST_SECONDS", 0.5)
+    monkeypatch.setattr("services.actors.patience.LEAST_SECONDS", 0.5)
     for size in (1, 2):
         said: list[str] = []
         pool = Pool(make, size, ahead=2, say=said.append)
@@ -161,7 +163,7 @@ def test_a_hung_actor_is_overtaken(make, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_where_the_slow_actor_is_first_its_answer_counts(make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("services.actors.pool.LEAST_SECONDS", 0.5)
+    monkeypatch.setattr("services.actors.patience.LEAST_SECONDS", 0.5)
     pool = Pool(make, 2)
     list(pool.map("sleep", [(0.01, tmp_path)] * 10))
     for _ in range(DEATHS_ALLOWED + 1):  # a spare that is let go while it starts is no failure to start

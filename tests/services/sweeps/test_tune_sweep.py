@@ -83,7 +83,6 @@ def sweep(programs, workplace: Path, mlflow_file: str, joined) -> Callable[[str]
 
 
 @pytest.mark.slow
-@pytest.mark.alone
 @pytest.mark.parametrize("name", ROWS)
 def test_each_sweep_ends_with_its_table(sweep, mlflow_file: str, name: str) -> None:
     tables, parent, children = sweep(name)
@@ -110,7 +109,6 @@ def test_each_sweep_ends_with_its_table(sweep, mlflow_file: str, name: str) -> N
 
 
 @pytest.mark.slow
-@pytest.mark.alone
 def test_a_search_stops_the_worse_and_names_the_best(sweep, workplace: Path) -> None:
     tables, _, children = sweep("search")
     assert len(tables["samples"]) == len(children) == 4
@@ -130,7 +128,6 @@ def steps_of(uri: str, run: Run, metric: str) -> list[int]:
 
 
 @pytest.mark.slow
-@pytest.mark.alone
 def test_a_killed_sweep_goes_on_where_it_was(
     programs, workplace: Path, mlflow_file: str, wait_for, data: dict[str, TaskDemonstrations]
 ) -> None:
@@ -206,7 +203,6 @@ def named(processes: Iterable[psutil.Process], name: str) -> list[psutil.Process
 
 
 @pytest.mark.slow
-@pytest.mark.alone
 def test_a_trial_that_fails_or_dies_leaves_the_others_alone(
     programs, workplace: Path, mlflow_file: str, wait_for
 ) -> None:

@@ -1,0 +1,18 @@
+"""What holds for all tests: the environment of Ray and MLflow."""
+
+import os
+import secrets
+
+# Ray reads these when it is first imported, after this file, here and in every program that a test starts.
+os.environ |= {
+    "RAY_AUTH_MODE": "token",
+    "RAY_AUTH_TOKEN": secrets.token_hex(32),
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "OMP_NUM_THREADS": "1",
+}
+for _name in (
+    "RAY_ADDRESS", "MLFLOW_TRACKING_URI", "MLFLOW_RUN_ID", "MLFLOW_EXPERIMENT_NAME", "DMIL_DATA", "DMIL_STORAGE",
+):  # fmt: skip
+    os.environ.pop(_name, None)
