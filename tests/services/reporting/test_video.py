@@ -23,7 +23,7 @@ def test_a_film_of_an_episode_beside_what_it_was_adapted_to(finished: FinishedRu
     ending = f"{'solved' if row.success else 'not solved'} in {row.steps} steps"
     assert f"door-close, 2-shot, episode 1: {ending}" in printed
     assert "warning" not in printed, "it came out as in the run"
-    pictures, _, width, _ = imageio.improps(path, index=...).shape
+    pictures, _, width, _ = imageio.imread(path, index=None).shape
     assert pictures > 10
     assert width >= 2 * FORMS["gif"].width
 
