@@ -158,6 +158,16 @@ class ExperimentConfig(Settings):
         return self
 
     @model_validator(mode="after")
+    def _no_more_shots_than_the_method_takes(self) -> "ExperimentConfig":
+        field, shots = self.method.bound_of_shots, max(self.evaluation.shots)
+        if field is not None and shots > (most := getattr(self.method, field)):
+            raise ValueError(
+                f"evaluation.shots: got {shots}; wanted at most method.{field}, {most}, which is what "
+                f"{self.method.name} has room for; give fewer, or train with a larger method.{field}"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _evaluate_checkpoints(self) -> "ExperimentConfig":
         every, checkpoint_every = self.evaluation.every, self.training.checkpoint_every
         if every is not None and every % checkpoint_every:

@@ -43,6 +43,8 @@ class MethodConfig(Settings):
 
     sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     """By size, paper, quick or smoke: what the method wants in place of the size's settings, by section."""
+    bound_of_shots: ClassVar[str | None] = None
+    """The setting that says to how many demonstrations the method can adapt, if there is such a bound."""
 
 
 class HierarchicalConfig(MethodConfig):

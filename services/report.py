@@ -23,7 +23,7 @@ KINDS = {
     "compare": "services.reporting.comparison",
     "sub-skills": "services.reporting.sub_skill_report",
     "video": "services.reporting.video",
-    "gallery": "services.gallery",
+    "gallery": "services.reporting.gallery",
     "tables": "services.sweeps.layout",
 }
 """What the program draws, and the module that does."""

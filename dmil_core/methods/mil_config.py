@@ -35,7 +35,6 @@ class MilConfig(MethodConfig):
     """State-action pairs that each of the two losses asks for at most (Table 10)."""
     shots: Size = 3
     """Most demonstrations in a support set: meta-training draws from one to so many."""
-    inner_learning_rate: Positive = 1e-2
     inner_learning_rate: Positive = 1e-3
     """α; the paper names none, Finn et al. 2017 have 0.001 to 0.01."""
     inner_steps: Size = 1
@@ -45,6 +44,7 @@ class MilConfig(MethodConfig):
     order: Literal["first", "second"] = "second"
     """Of the meta-gradient: exact, or taken at the adapted parameters."""
 
+    bound_of_shots: ClassVar[str | None] = "shots"
     sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "paper": {"evaluation": {"fine_tuning_steps": 1, "learning_rate": 1e-3}},
         "quick": {

@@ -16,6 +16,7 @@ from services.report import PAGE
 from services.reporting.adaptation_curves import adaptation_section, measure
 from services.reporting.curves import training_curves
 from services.reporting.embedding import embedding_section
+from services.reporting.failures import failures_of_run
 from services.reporting.finished import FinishedRun
 from services.reporting.lineup import has_sub_skills, line_up
 from services.reporting.page import Section, write_page
@@ -49,10 +50,17 @@ def _origin(finished: FinishedRun) -> list[Section]:
     return [settings_of_run(finished), origin_of_run(finished), episodes_of_run(finished)]
 
 
-SECTIONS: Sequence[Writing] = (_rates, _sub_skills, _curves, _origin)
-"""Of the page, in their order."""
 AT_THE_END: Sequence[Writing] = (_rates, _curves, _origin)
-"""Those for which it is enough to read the run's folder: a run writes them when it ends."""
+"""The sections for which it is enough to read the run's folder: a run writes them when it ends."""
+
+
+def _all_sections(*, videos: bool) -> Sequence[Writing]:
+    """Return all sections of the page, in their order."""
+
+    def failures(finished: FinishedRun) -> list[Section]:
+        return [failures_of_run(finished, videos=videos)]
+
+    return _rates, failures, _sub_skills, _curves, _origin
 
 
 @dataclass(frozen=True)
@@ -65,6 +73,8 @@ class Arguments:
     """The folder that runs' own folders are in."""
     output: Path | None = None
     """The file to write; report/report.html in the run's folder if not given."""
+    videos: bool = False
+    """Also film an episode that failed in each of the worst tasks; the films become part of the page."""
     adaptation: bool = False
     """Also measure success and loss over fine-tuning steps, for 1, 3, 5 and 10 shots, in at most four meta-testing
     tasks: some minutes, once; the page shows it from then on."""
@@ -112,7 +122,8 @@ def run(arguments: Sequence[str]) -> None:
     if given.adaptation:
         with open_runner(given.runner, finished.experiment.suite, given.workers) as runner:
             measure(finished, runner)
-    with Bar("report", len(SECTIONS)) as bar:
-        write_run_page(finished, path, SECTIONS, lambda: bar.advance(1))
+    sections = _all_sections(videos=given.videos)
+    with Bar("report", len(sections)) as bar:
+        write_run_page(finished, path, sections, lambda: bar.advance(1))
     console.print(f"report: {path} ({path.stat().st_size / 1e6:.1f} MB)", markup=False)
     console.print(f"open it in a browser: {path.absolute().as_uri()}", markup=False)

@@ -21,7 +21,7 @@ from services.reporting.replay import Replay, Seen, replaying
 from services.results import EpisodeResult
 from services.suites.rendering import View
 
-__all__ = ["Arguments", "CameraError", "camera_of", "command", "run", "side_of"]
+__all__ = ["Arguments", "CameraError", "camera_of", "command", "name_of", "run", "side_of"]
 
 
 @dataclass(frozen=True)

@@ -127,3 +127,18 @@ def test_support_sets_are_disjoint(held_out: int, allowed: bool) -> None:
     else:
         with pytest.raises(ValidationError, match=r"demonstrations\.held_out: got 19; wanted at least 20"):
             ExperimentConfig(**settings)
+
+
+@pytest.mark.parametrize(("shots", "allowed"), [(3, True), (4, False)])
+def test_mil_is_not_asked_to_adapt_to_more_than_it_has_room_for(shots: int, allowed: bool) -> None:
+    def adapting(method: str, room: dict[str, int]) -> ExperimentConfig:
+        evaluation = EvaluationConfig(shots=(1, shots))
+        return ExperimentConfig.model_validate({"method": {"name": method, **room}, "evaluation": evaluation})
+
+    assert adapting("mil", {"shots": 4}).evaluation.shots == (1, shots)
+    assert adapting("dmil", {}).evaluation.shots == (1, shots)
+    if allowed:
+        assert adapting("mil", {}).evaluation.shots == (1, 3)
+    else:
+        with pytest.raises(ValidationError, match=r"evaluation\.shots: got 4; wanted at most method\.shots, 3"):
+            adapting("mil", {})

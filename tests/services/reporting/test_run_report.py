@@ -129,6 +129,7 @@ def test_the_program_writes_it_where_it_is_told_and_says_how_to_open_it(finished
     assert f"report: {path}" in printed
     assert path.as_uri() in printed
     assert "<title>tiny: dmil on ml10</title>" in path.read_text()
+    assert ">What failed</h2>" in path.read_text()
 
 
 def test_what_is_no_finished_run_is_told_in_words(finished: FinishedRun, tmp_path: Path, complaint, monkeypatch):

@@ -1,0 +1,196 @@
+"""What failed: all episodes of the worst tasks once more, by how far each has come at every step."""
+
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from services.reporting.drawing import Picture, colour_of, drawn, panels
+from services.reporting.film import FORMS, film_of, write_film
+from services.reporting.finished import FinishedRun
+from services.reporting.page import Clip, Commands, DataTable, Part, Prose, Section
+from services.reporting.replay import Replay, ReplayError, Seen, replaying
+from services.reporting.video import camera_of, command, name_of, side_of
+from services.results import EpisodeResult
+from services.suites.base import Measure, measure_of
+
+__all__ = ["draw_episodes", "failures_of_run", "worst_tasks"]
+
+MOST_TASKS = 3
+MOST_EPISODES = 20
+"""Of a task; whole trials are run, until there are so many."""
+FAILED: dict[str, Any] = {"color": colour_of(3), "linestyle": "solid", "marker": "x"}
+SOLVED: dict[str, Any] = {"color": colour_of(0), "linestyle": "dashed", "marker": "o"}
+"""A marker stands at the end of an episode."""
+APART = 0.015
+"""Lines of scores, which would cover each other, are drawn so far apart."""
+
+
+def failures_of_run(finished: FinishedRun, *, videos: bool = False) -> Section:
+    """Return the section on the tasks that failed most: their episodes are run again, and drawn step by step.
+
+    Args:
+        finished: the run.
+        videos: film an episode of each task too, into the run's folder ``report/videos``.
+
+    Raises:
+        RenderingError: if there is nothing here to film with.
+        CameraError: if the suite names no camera to film with.
+        DiskFullError: for want of space for films.
+    """
+    title, worst = "What failed", worst_tasks(finished.episodes)
+    if not worst:
+        return Section(title, [Prose(f"Nothing: all {len(finished.episodes)} episodes were solved.")])
+    parts: list[Part] = [
+        Prose(
+            f"The {'task' if len(worst) == 1 else f'{len(worst)} tasks'} with the lowest success rates over all shots, "
+            "those of meta-testing before those of meta-training; of each, the episodes with the number of shots at "
+            "which most failed. They were run again for this page."
+        )
+    ]
+    rows: list[list[str | int | float]] = []
+    try:
+        with replaying(finished) as replay:
+            for of_task in worst:
+                found, own_rows = _of_task(replay, of_task, videos=videos)
+                parts += found
+                rows += own_rows
+    except ReplayError as error:
+        return Section(title, [Prose(f"Their episodes cannot be run again here: {error}.")])
+    head = ["task", "shots", "episode", "solved", "steps", "measure", "first step", "smallest", "largest", "last step"]
+    parts.append(DataTable("Episodes that were run again", head, rows))
+    return Section(title, parts)
+
+
+def worst_tasks(episodes: Sequence[EpisodeResult]) -> list[list[EpisodeResult]]:
+    """Return the rows of the tasks that failed most, each with the number of shots at which most failed.
+
+    Tasks of meta-testing, which the run is for, come before the others; those in which nothing failed are left out.
+    """
+    failed = [rows for rows in _grouped(episodes, lambda row: (row.split, row.task)) if _rate(rows) < 1]
+    failed.sort(key=lambda rows: (rows[0].split != "meta-testing", _rate(rows)))
+    return [
+        min(_grouped(rows, lambda row: row.shots), key=lambda of: (_rate(of), of[0].shots))
+        for rows in failed[:MOST_TASKS]
+    ]
+
+
+def _grouped(rows: Sequence[EpisodeResult], by: Callable[[EpisodeResult], Hashable]) -> list[list[EpisodeResult]]:
+    groups: dict[Hashable, list[EpisodeResult]] = defaultdict(list)
+    for row in rows:
+        groups[by(row)].append(row)
+    return list(groups.values())
+
+
+def _rate(rows: Sequence[EpisodeResult]) -> float:
+    return sum(row.success for row in rows) / len(rows)
+
+
+def _of_task(
+    replay: Replay, rows: Sequence[EpisodeResult], *, videos: bool
+) -> tuple[list[Part], list[list[str | int | float]]]:
+    """Return what the page shows of a task, and a line of the table for each episode."""
+    run, task = replay.run, rows[0].task
+    trials = sorted(_grouped(rows, lambda row: row.draw), key=_rate)
+    filmed = next(row for row in trials[0] if not row.success)
+    seen = _run_again(replay, trials, filmed if videos else None)
+    measure = measure_of(run.experiment.suite, task)
+    parts: list[Part] = [Prose(_told(rows, seen, measure))]
+    if measure is not None and (drawn_ones := [one for one in seen if _course(one, measure).size]):
+        parts.append(draw_episodes(drawn_ones, measure, run.experiment.suite.best_score))
+    if videos:
+        (one,) = [one for one in seen if one.row == filmed]
+        parts.append(_film(run, one))
+    else:
+        parts.append(Commands(f"To see one that failed in {task}", [command(run, filmed)]))
+    return parts, [_table_row(one, measure) for one in seen]
+
+
+def _run_again(replay: Replay, trials: Sequence[Sequence[EpisodeResult]], filmed: EpisodeResult | None) -> list[Seen]:
+    """Run whole trials, until there are enough episodes."""
+    film = None if filmed is None else film_of(camera_of(replay.run), filmed.steps, FORMS["mp4"])
+    seen: list[Seen] = []
+    for trial in trials:
+        if len(seen) >= MOST_EPISODES:
+            break
+        numbers = [filmed.episode] if filmed is not None and filmed in trial else []
+        seen += replay.trial(trial[0], film, numbers)
+    return sorted(seen, key=lambda one: one.row.episode)
+
+
+def _course(seen: Seen, measure: Measure) -> Float64[np.ndarray, " steps"]:
+    """Return the measure at each step: at none, if the policy had diverged before the first one."""
+    return seen.footage.numbers.get(measure.name, np.zeros(0))
+
+
+def _told(rows: Sequence[EpisodeResult], seen: Sequence[Seen], measure: Measure | None) -> str:
+    first = rows[0]
+    solved = sum(row.success for row in rows)
+    told = f"{first.task} ({first.split}), {first.shots}-shot: {solved} of {len(rows)} episodes were solved"
+    told += "." if len(seen) == len(rows) else f"; {len(seen)} of them were run again, the worst support sets first."
+    if differences := [one.difference for one in seen if one.difference is not None]:
+        told += f" {len(differences)} came out otherwise than in the run: {differences[0]}."
+    if measure is None:
+        told += " The suite does not measure how far an episode has come, only whether it is solved."
+    return told
+
+
+def _table_row(seen: Seen, measure: Measure | None) -> list[str | int | float]:
+    row, episode = seen.row, seen.watched.episode
+    course = np.zeros(0) if measure is None else _course(seen, measure)
+    numbers = (course[0], course.min(), course.max(), course[-1]) if course.size else ()
+    told = [f"{number:.3g}" for number in numbers] or [""] * 4
+    what = "none" if measure is None else measure.words
+    return [row.task, row.shots, row.episode, "yes" if episode.success else "no", episode.steps, what, *told]
+
+
+def draw_episodes(seen: Sequence[Seen], measure: Measure, best_score: int) -> Picture:
+    """Draw how far episodes of one task have come at every step: a line each, failures told apart by more than colour.
+
+    Args:
+        seen: the episodes.
+        measure: of their task.
+        best_score: of an episode in which all is done.
+    """
+    row, scored = seen[0].row, measure.name == "score"
+    kinds = {success: [one for one in seen if one.watched.episode.success is success] for success in (True, False)}
+    with panels(width=7.5, height=3.1) as (figure, (axis,)):
+        for success, style, word in ((True, SOLVED, "solved"), (False, FAILED, "failed")):
+            for place, one in enumerate(kinds[success]):
+                course = _course(one, measure) + scored * APART * place
+                steps = np.arange(1, len(course) + 1)
+                label = f"{word} ({len(kinds[success])})" if place == 0 else None
+                drawing: dict[str, Any] = {"drawstyle": "steps-post"} if scored else {}
+                axis.plot(steps, course, label=label, markevery=[-1], linewidth=1, alpha=0.8, **style, **drawing)
+        axis.set(xlabel="step", ylabel=measure.words, xlim=(0, None))
+        if scored:
+            axis.set(ylim=(-0.1, best_score * 1.1))
+        else:
+            axis.set_ylim(bottom=0)
+        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
+        title = f"{row.task}, {row.shots}-shot: {measure.words} at each step"
+        told = " ".join(
+            _in_words(word, kinds[success], measure) for success, word in ((False, "failed"), (True, "solved"))
+        )
+        return drawn(figure, title, f"A line is an episode; a cross or a dot is its end. {told}")
+
+
+def _in_words(word: str, seen: Sequence[Seen], measure: Measure) -> str:
+    if not seen:
+        return f"None {word}."
+    courses = [_course(one, measure) for one in seen]
+    first, low, high, last = np.mean([(own[0], own.min(), own.max(), own[-1]) for own in courses], axis=0)
+    return (
+        f"{len(seen)} {word}: on average {first:.3g} at the first step, {low:.3g} at the smallest, {high:.3g} at the "
+        f"largest and {last:.3g} at the last."
+    )
+
+
+def _film(run: FinishedRun, seen: Seen) -> Clip:
+    side = side_of(run, seen)
+    path: Path = run.folder / "report" / "videos" / f"{name_of(seen.row)}.mp4"
+    write_film(path, [side])
+    return Clip(f"{side.title}: {side.ending}", path)
