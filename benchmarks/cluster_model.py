@@ -3,7 +3,7 @@
 import math
 from typing import NamedTuple
 
-__all__ = ["Costs", "Network", "Prediction", "calls_of_a_tree", "predict"]
+__all__ = ["Costs", "Network", "Prediction", "calls_of_a_tree", "predict", "seconds_of_a_tree"]
 
 
 class Costs(NamedTuple):
@@ -25,6 +25,10 @@ class Costs(NamedTuple):
     """Bytes a second into the object store."""
     add: float
     """Bytes of gradients added a second."""
+    demonstrations: int
+    """Bytes of all demonstrations."""
+    resident: int
+    """Bytes of memory that a worker had at most."""
 
 
 class Network(NamedTuple):
@@ -35,6 +39,14 @@ class Network(NamedTuple):
     """Of one node's link, in each direction: 10 Gbit/s."""
     latency: float = 1e-4
     """Seconds."""
+
+    def nodes(self, workers: int) -> int:
+        """Return how many nodes so many workers are on."""
+        return -(-workers // self.workers_per_node)
+
+    def send(self, size: int) -> float:
+        """Return the seconds in which so many bytes come from one node to another."""
+        return self.latency + size / self.bytes_per_second
 
 
 class Prediction(NamedTuple):
@@ -68,31 +80,44 @@ def calls_of_a_tree(terms: int, fan_in: int) -> int:
     return calls
 
 
-def predict(costs: Costs, network: Network, workers: int, slots: int, fan_in: int, *, relayed: bool) -> Prediction:
+def seconds_of_a_tree(costs: Costs, network: Network, terms: int, fan_in: int) -> float:
+    """Return what it takes to add gradients of so many workers, from them in the store to their sum with the learner.
+
+    With a fan-in of all `terms` one process adds all of them.
+    """
+    seconds, left = 0.0, terms
+    while left > 1:
+        together = min(fan_in, left)
+        fetched = network.send(costs.buffer) * (together - 1) if left > network.workers_per_node else 0.0
+        seconds += fetched + together * costs.buffer / costs.add + costs.buffer / costs.store + costs.call
+        left = -(-left // fan_in)
+    return seconds + (network.send(costs.buffer) if network.nodes(terms) > 1 else 0.0)
+
+
+def predict(
+    costs: Costs, network: Network, workers: int, slots: int, fan_in: int, *, relayed: bool, together: int = 1
+) -> Prediction:
     """Return T(W) of ``docs/performance.md``, for one block a worker.
 
     Args:
         costs: measured.
         network: assumed.
-        workers: W.
+        workers: W; there is work for no more than there are groups of slots.
         slots: of all workers together.
         fan_in: f.
         relayed: a node passes the parameters on to others as soon as it has them; else all fetch them from the
             learner's node.
+        together: slots of a group, which one worker computes.
     """
-    nodes = -(-workers // network.workers_per_node)
+    groups = -(-slots // together)
+    workers = min(workers, groups)
+    nodes = network.nodes(workers)
     put = costs.buffer / costs.store
-    send = network.latency + costs.buffer / network.bytes_per_second
     hops = math.ceil(math.log2(nodes)) if relayed else nodes - 1
-    compute = -(-slots // workers) * costs.slot
+    compute = min(slots, -(-groups // workers) * together) * costs.slot
     # The largest of W normal deviates is about sqrt(2 ln W) standard deviations above the mean.
     waiting = math.sqrt(2 * math.log(workers)) * costs.spread * compute
-    reduction, terms = put + costs.call, workers
-    while terms > 1:
-        together = min(fan_in, terms)
-        fetched = send * (together - 1) if terms > network.workers_per_node else 0.0
-        reduction += fetched + together * costs.buffer / costs.add + put + costs.call
-        terms = -(-terms // fan_in)
-    reduction += send if nodes > 1 else 0.0
+    reduction = put + costs.call + seconds_of_a_tree(costs, network, workers, fan_in)
     driver = costs.submit * (workers + calls_of_a_tree(workers, fan_in) + 1)
-    return Prediction(workers, put + costs.call + hops * send, compute, waiting, reduction, costs.step, driver)
+    broadcast = put + costs.call + hops * network.send(costs.buffer)
+    return Prediction(workers, broadcast, compute, waiting, reduction, costs.step, driver)

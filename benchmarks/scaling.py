@@ -11,7 +11,6 @@ for the slower worker counts as overhead too.
 
 import os
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,32 +20,21 @@ import numpy as np
 from rich.box import SIMPLE
 from rich.table import Table
 
-from benchmarks.cluster_model import Costs, Network, Prediction, calls_of_a_tree, predict
+from benchmarks.cluster_model import calls_of_a_tree
 from benchmarks.timing import alternate, write_rows
+from benchmarks.workload import Size, made_up_plan
 from dmil_core.configs import PRESETS
-from dmil_core.demonstrations import Demonstration
-from dmil_core.dmil_config import DmilConfig
-from dmil_core.methods.dmil import Dmil
-from dmil_core.networks import flatten
-from dmil_core.outer_loop import OuterState, add
-from dmil_core.seeding import stream
-from services.actors.freight import pack
 from services.command_line import exit_code, parse
 from services.progress import console
 from services.ray_meta_training import FAN_IN, RayMetaTraining
 from services.ray_runner import RayRunner
-from services.runners import LocalMetaTraining, MetaTraining, Plan
+from services.runners import LocalMetaTraining, MetaTraining
 from services.suites.metaworld import MetaWorldSuite
 from services.timing import Timing
 
 __all__ = ["Arguments", "run"]
 
-Size = Literal["quick", "paper"]
 WORKERS = (1, 2)
-STEPS = 100
-"""Of a made-up demonstration."""
-CALLS = 200
-"""That the cost of one is the mean of."""
 
 
 class Turns(NamedTuple):
@@ -76,8 +64,6 @@ class Arguments:
     """Turns that each takes; by default 6 at quick size and 2 at paper size."""
     json: Path | None = None
     """File for the rows."""
-    simulate: int | None = None
-    """Also predict, from what was measured, the iteration's time with up to so many workers."""
 
 
 class Row(NamedTuple):
@@ -95,33 +81,6 @@ class Row(NamedTuple):
     """Written once an iteration, and read by each node once."""
     gradient_bytes: int
     """Written by workers in an iteration: a gradient for each block and each addition."""
-
-
-def made_up_plan(size: Size) -> Plan:
-    """Return a plan as a preset's, with demonstrations of noise."""
-    config = PRESETS[f"ml10-{size}"]
-    suite = MetaWorldSuite(config.suite)
-    settings = config.demonstrations
-    draw = np.random.default_rng(0)
-    demonstrations = {
-        task: [
-            Demonstration(
-                f"{index:03d}",
-                task,
-                draw.normal(size=(STEPS, suite.obs_dim)).astype(np.float32),
-                draw.uniform(-1, 1, size=(STEPS, suite.action_dim)).astype(np.float32),
-            )
-            for index in range(settings.per_task - settings.held_out)
-        ]
-        for task in suite.train_tasks
-    }
-    assert isinstance(config.method, DmilConfig)
-    method = Dmil.prepared(config.method, suite.action_dim, [d for task in demonstrations.values() for d in task])
-    initial = method.initial_parameters(stream(0, "initial parameters"))
-    shapes = {name: tensor.shape for name, tensor in initial.items()}
-    state = OuterState.start(flatten(initial).numpy())
-    training = config.training.model_copy(update={"slots_per_group": SLOTS_PER_GROUP})
-    return Plan(method, shapes, demonstrations, state, training, seed=0)
 
 
 def measure(trainings: Mapping[str, MetaTraining], turns: Turns) -> dict[str, list[Timing]]:
@@ -202,127 +161,20 @@ def table(rows: Sequence[Row]) -> Table:
     return view
 
 
-def measured_costs(training: RayMetaTraining, timings: Sequence[Timing], slots: int) -> Costs:
-    """Return what the model of a cluster is fed with.
-
-    Args:
-        training: by one Ray worker, with all slots in one block.
-        timings: of its iterations.
-        slots: of an iteration.
-    """
-    import ray
-
-    parameters = training.state().parameters
-    pool = training._pool
-    small = [np.zeros(1, np.float32)]
-
-    def seconds(work: Callable[[], object]) -> float:
-        began = time.perf_counter()
-        work()
-        return time.perf_counter() - began
-
-    def call() -> None:
-        pool.result(pool.submit("add", small))
-
-    def many() -> None:
-        calls = [pool.submit("add", small, beside=first) for _ in range(CALLS)]
-        pool.result(calls[-1])
-
-    first = pool.submit("add", small)
-    pool.result(first)
-    compute = [timing.compute for timing in timings]
-    return Costs(
-        slot=float(np.median(compute)) / slots,
-        spread=float(np.std(compute) / np.mean(compute)),
-        step=float(np.median([timing.step for timing in timings])),
-        call=float(np.median([seconds(call) for _ in range(CALLS // 4)])),
-        submit=seconds(many) / CALLS,
-        buffer=parameters.nbytes,
-        store=parameters.nbytes / float(np.median([seconds(lambda: ray.put(pack(parameters))) for _ in range(10)])),
-        add=FAN_IN
-        * parameters.nbytes
-        / float(np.median([seconds(lambda: add([parameters] * FAN_IN)) for _ in range(5)])),
-    )
-
-
-def predictions(costs: Costs, most: int, *, weak: bool, relayed: bool) -> list[Prediction]:
-    """Return what is expected of 1, 2, 4 ... and `most` workers.
-
-    Args:
-        costs: measured.
-        most: workers.
-        weak: a slot for each worker; else `most` slots however many workers.
-        relayed: see `predict`.
-    """
-    counts = [2**power for power in range(most.bit_length()) if 2**power < most] + [most]
-    return [
-        predict(costs, Network(), workers, workers if weak else most, FAN_IN, relayed=relayed) for workers in counts
-    ]
-
-
-def prediction_table(title: str, found: Sequence[Prediction]) -> Table:
-    """Lay predictions out for the terminal; efficiency is against one worker."""
-    view = Table(title=title, box=SIMPLE)
-    for column in ("workers", *Prediction._fields[1:], "iteration", "efficiency", "largest overhead"):
-        view.add_column(column, justify="right")
-    one = found[0]
-    for this in found:
-        # Slots a second and worker: the slots are in proportion to compute times workers.
-        work, work_of_one = this.compute * this.workers, one.compute
-        efficiency = work / this.iteration / this.workers / (work_of_one / one.iteration)
-        view.add_row(
-            str(this.workers),
-            *(f"{1e3 * seconds:.1f}" for seconds in (*this[1:], this.iteration)),
-            f"{efficiency:.0%}",
-            this.largest,
-        )
-    return view
-
-
-def show_predictions(size: Size, costs: Costs, most: int) -> None:
-    """Print how the iteration's time is expected to grow."""
-    network = Network()
-    console.print(f"\n{size}: measured costs: {_in_words(costs)}")
-    console.print(
-        f"assumed: {network.workers_per_node} workers a node, {network.bytes_per_second * 8e-9:.0f} Gbit/s and "
-        f"{network.latency * 1e3:.1f} ms between nodes, fan-in {FAN_IN}"
-    )
-    for weak in (True, False):
-        for relayed in (False, True):
-            title = (
-                f"{size}: {'a slot for each worker' if weak else f'{most} slots'}, parameters "
-                f"{'relayed from node to node' if relayed else 'fetched from the learner by every node'}; milliseconds"
-            )
-            console.print(prediction_table(title, predictions(costs, most, weak=weak, relayed=relayed)))
-
-
-def _in_words(costs: Costs) -> str:
-    return (
-        f"slot {1e3 * costs.slot:.2f} ms ± {costs.spread:.0%}, step {1e3 * costs.step:.2f} ms, call "
-        f"{1e3 * costs.call:.2f} ms, driver {1e3 * costs.submit:.2f} ms a call, buffer {costs.buffer / 1e6:.1f} MB, "
-        f"into the store {costs.store / 1e9:.1f} GB/s, adding {costs.add / 1e9:.1f} GB/s"
-    )
-
-
 def run(arguments: Sequence[str]) -> None:
     """Run the benchmark."""
     given = parse(Arguments, __doc__ or "", arguments, Arguments())
     rows: list[Row] = []
-    costs: dict[Size, Costs] = {}
     runner = RayRunner(MetaWorldSuite(PRESETS["ml10-quick"].suite), sum(WORKERS))
     try:
         for size in given.sizes:
-            plan, turns = made_up_plan(size), TURNS[size]
+            plan, turns = made_up_plan(f"ml10-{size}", SLOTS_PER_GROUP), TURNS[size]
             turns = turns._replace(rounds=given.rounds or turns.rounds)
             console.print(f"{size}: {turns.rounds} rounds of {turns.iterations} iterations")
             trainings: dict[str, MetaTraining] = {"local": LocalMetaTraining(plan)}
-            by_ray = {f"ray {workers}": RayMetaTraining(plan, workers) for workers in WORKERS}
-            trainings |= by_ray
+            trainings |= {f"ray {workers}": RayMetaTraining(plan, workers) for workers in WORKERS}
             timings = measure(trainings, turns)
             rows += rows_of(size, trainings, timings)
-            if given.simulate:
-                one = f"ray {WORKERS[0]}"
-                costs[size] = measured_costs(by_ray[one], timings[one], plan.settings.tasks_per_iteration)
             for training in trainings.values():
                 training.close()
     finally:
@@ -330,8 +182,6 @@ def run(arguments: Sequence[str]) -> None:
     console.print(table(rows))
     console.print(f"{os.cpu_count()} CPUs, load average {os.getloadavg()[0]:.1f}")
     console.print("\n".join(f"missed: {line}" for line in misses(rows)) or "all targets are met")
-    for size, found in costs.items():
-        show_predictions(size, found, given.simulate or 1)
     if given.json is not None:
         machine: dict[str, Any] = {"cpus": os.cpu_count(), "load_average": os.getloadavg()[0]}
         write_rows(given.json, [row._asdict() | {"seconds": row.seconds._asdict()} | machine for row in rows])

@@ -2,16 +2,32 @@
 
 from typing import Literal, TypeAlias
 
+import numpy as np
 import torch
 
 from benchmarks.masked_twin import Sets
 from dmil_core.configs import PRESETS
+from dmil_core.demonstrations import Demonstration
 from dmil_core.dmil_config import DmilConfig
 from dmil_core.losses import Steps
+from dmil_core.methods.dmil import Dmil
 from dmil_core.networks import Parameters, flatten, initialise, unflatten
+from dmil_core.outer_loop import OuterState
 from dmil_core.seeding import stream
+from services.runners import Plan
+from services.suites.metaworld import MetaWorldSuite
 
-__all__ = ["ACTION_DIM", "OBS_DIM", "Size", "as_in_a_run", "draw_parameters", "draw_sets", "draw_steps", "settings"]
+__all__ = [
+    "ACTION_DIM",
+    "OBS_DIM",
+    "Size",
+    "as_in_a_run",
+    "draw_parameters",
+    "draw_sets",
+    "draw_steps",
+    "made_up_plan",
+    "settings",
+]
 
 OBS_DIM, ACTION_DIM = 39, 4
 Size: TypeAlias = Literal["paper", "quick"]
@@ -53,3 +69,35 @@ def draw_parameters(config: DmilConfig) -> Parameters:
 def as_in_a_run(parameters: Parameters) -> Parameters:
     """Return a copy laid out in one vector, as a worker gets them."""
     return unflatten(flatten(parameters), {name: tensor.shape for name, tensor in parameters.items()})
+
+
+def made_up_plan(preset: str, slots_per_group: int | None = None) -> Plan:
+    """Return the plan of one of Meta-World's presets, with demonstrations of noise, 100 steps each.
+
+    Args:
+        preset: its name.
+        slots_per_group: if not the preset's.
+    """
+    config = PRESETS[preset]
+    suite = MetaWorldSuite(config.suite)
+    settings, training = config.demonstrations, config.training
+    draw = np.random.default_rng(0)
+    demonstrations = {
+        task: [
+            Demonstration(
+                f"{index:03d}",
+                task,
+                draw.normal(size=(TRAJECTORY_STEPS["paper"], suite.obs_dim)).astype(np.float32),
+                draw.uniform(-1, 1, size=(TRAJECTORY_STEPS["paper"], suite.action_dim)).astype(np.float32),
+            )
+            for index in range(settings.per_task - settings.held_out)
+        ]
+        for task in suite.train_tasks
+    }
+    assert isinstance(config.method, DmilConfig)
+    method = Dmil.prepared(config.method, suite.action_dim, [d for task in demonstrations.values() for d in task])
+    initial = method.initial_parameters(stream(0, "initial parameters"))
+    shapes = {name: tensor.shape for name, tensor in initial.items()}
+    if slots_per_group is not None:
+        training = training.model_copy(update={"slots_per_group": slots_per_group})
+    return Plan(method, shapes, demonstrations, OuterState.start(flatten(initial).numpy()), training, seed=0)

@@ -23,19 +23,27 @@ keep() { # a secret's file: what comes in, if there is none yet
 drawn 32 | keep ray_token
 drawn 24 | keep postgres_password
 drawn 24 | keep grafana_password
-# The artifact store and its one client, MLflow, share two keys: never one file without the other.
-if ! [ -s store.json ] || ! [ -s store_credentials ]; then
-    rm -f store.json store_credentials
-    access=$(drawn 10) secret=$(drawn 24)
+# The object store shares two keys with each of its clients: never one of these files without the others.
+# MLflow's open everything, for it makes the buckets; those of Ray's processes open the bucket dmil alone.
+if ! [ -s store.json ] || ! [ -s store_credentials ] || ! [ -s storage_credentials ]; then
+    rm -f store.json store_credentials storage_credentials
+    access=$(drawn 10) secret=$(drawn 24) own_access=$(drawn 10) own_secret=$(drawn 24)
     keep store.json <<JSON
 {"identities": [{"name": "mlflow", "actions": ["Admin", "Read", "Write", "List", "Tagging"],
-  "credentials": [{"accessKey": "$access", "secretKey": "$secret"}]}]}
+  "credentials": [{"accessKey": "$access", "secretKey": "$secret"}]},
+ {"name": "dmil", "actions": ["Read:dmil", "Write:dmil", "List:dmil"],
+  "credentials": [{"accessKey": "$own_access", "secretKey": "$own_secret"}]}]}
 JSON
     keep store_credentials <<INI
 [default]
 aws_access_key_id = $access
 aws_secret_access_key = $secret
 INI
+    keep storage_credentials <<INI
+[default]
+aws_access_key_id = $own_access
+aws_secret_access_key = $own_secret
+INI
 else
-    echo "store.json, store_credentials: kept"
+    echo "store.json, store_credentials, storage_credentials: kept"
 fi

@@ -61,7 +61,8 @@ class Arguments:
     runner: RunnerKind = "ray"
     """Where to work: in Ray actors, or in this process; the result is the same to the bit."""
     workers: int | None = None
-    """Ray workers of each kind, one for each CPU of the cluster if not given; they do not change the result."""
+    """Ray workers of each kind, one for each CPU of the cluster if not given; they do not change the result. Those that
+    it has no CPU for yet join when it has grown."""
     overlap_evaluation: bool = True
     """Go on with meta-training during the evaluations that --evaluation.every asks for; the results are the same."""
     on_nonfinite: OnNonfinite = "stop"

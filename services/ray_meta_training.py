@@ -54,6 +54,7 @@ class RayMetaTraining:
         fan_in: int = FAN_IN,
         gpus: float = 0.0,
         meter: Meter | None = None,
+        enough: int | None = None,
     ) -> None:
         """Start the actors; the demonstrations travel to each node once.
 
@@ -64,6 +65,7 @@ class RayMetaTraining:
             fan_in: gradients that a worker adds at a time, a power of two.
             gpus: of each adaptation worker.
             meter: is told of iterations, workers, and slots that are done again.
+            enough: workers to begin with; the others join when there is room for them.
         """
         import ray
 
@@ -82,6 +84,7 @@ class RayMetaTraining:
             ahead=2,
             say=console.print,
             witness=self.crew,
+            enough=enough,
         )
         self._kept, self._done, self._told = plan.state, plan.state.iteration, plan.state.iteration
         self._begun = self._done

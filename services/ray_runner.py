@@ -6,7 +6,7 @@ from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from dmil_core.errors import WorkError
-from services.actors.faults import DeadlyCallError, NoRoomError
+from services.actors.faults import DeadlyCallError
 from services.actors.simulation import SimulationWorker, piece_of_call
 from services.cluster import cpus, joined
 from services.metrics import Crew, Meter, RayMeter
@@ -34,7 +34,8 @@ class RayRunner:
 
         Args:
             suite: whose tasks are worked on.
-            workers: of each kind; `None` takes one for each CPU of the cluster.
+            workers: of each kind; `None` takes one for each CPU of the cluster. Those that the cluster has no CPU for
+                join when it has: a cluster that grows by itself grows for them.
             gpus: that each adaptation worker has to itself, which may be less than one.
         """
         self._cluster = ExitStack()
@@ -46,8 +47,7 @@ class RayRunner:
         self._ray, self._pool = ray, Pool
         self._asked_for, self._gpus = workers, gpus
         if workers is not None and workers > cpus():
-            self._cluster.close()
-            raise NoRoomError(f"--workers: got {workers}; the cluster has {cpus()} CPUs; ask for at most as many")
+            console.print(f"--workers {workers}: the cluster has {cpus()} CPUs now; further workers join as it grows")
         self.meter: Meter = RayMeter(suite.name)
         self._crew = Crew("simulation", self.meter)
         self._suite = ray.put(suite)
@@ -57,8 +57,12 @@ class RayRunner:
     @property
     def workers(self) -> int:
         """How many workers of each kind there may be now: nodes come and go."""
-        there = cpus()
-        return min(self._asked_for or there, there)
+        return min(self._wanted, cpus())
+
+    @property
+    def _wanted(self) -> int:
+        """How many there are to be, some of them when the cluster has grown."""
+        return self._asked_for or cpus()
 
     @property
     def staff(self) -> list[Workers]:
@@ -73,9 +77,12 @@ class RayRunner:
     def simulate(self, method: str, calls: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
         """Spread the calls over the simulation workers."""
         # While meta-training pauses, its workers keep their CPUs: the simulation's must not wait for one.
-        remote = self._ray.remote(num_cpus=0 if self._meta_training() else 1)(SimulationWorker)
-        size = min(self.workers, len(calls))
-        pool = self._pool(lambda: remote.remote(self._suite), size, say=console.print, witness=self._crew)
+        pausing = self._meta_training()
+        remote = self._ray.remote(num_cpus=0 if pausing else 1)(SimulationWorker)
+        size, enough = min(self.workers if pausing else self._wanted, len(calls)), self.workers
+        pool = self._pool(
+            lambda: remote.remote(self._suite), size, say=console.print, witness=self._crew, enough=enough
+        )
         try:
             with naming_the_deadly():
                 yield from pool.results(_submitted(pool, method, calls))
@@ -93,7 +100,9 @@ class RayRunner:
 
     def meta_train(self, plan: Plan) -> "RayMetaTraining":
         """Start the learner and the adaptation workers."""
-        self._training = RayMetaTraining(plan, lambda: self.workers, gpus=self._gpus, meter=self.meter)
+        self._training = RayMetaTraining(
+            plan, lambda: self._wanted, gpus=self._gpus, meter=self.meter, enough=self.workers
+        )
         return self._training
 
     def _meta_training(self) -> bool:

@@ -1,4 +1,4 @@
-"""A copy of a run's folder in a storage that all machines reach: another machine can go on with the run from there."""
+"""A copy of a run, or of what a sweep trained, in a storage that all machines reach: another goes on from there."""
 
 import threading
 import time
@@ -13,7 +13,9 @@ __all__ = ["Replica", "replicated", "restored"]
 
 NAMED = r"iteration-\d{7,}"
 IDENTITY = "mlflow_run.json"
-RECORDS = (IDENTITY, "tracking.jsonl", "config.json", "adaptations.jsonl", "episodes.jsonl", "summary.json")
+RECORDS = (
+    IDENTITY, "tracking.jsonl", "config.json", "metrics.json", "adaptations.jsonl", "episodes.jsonl", "summary.json",
+)  # fmt: skip
 """What else a run needs to go on, and to be looked at. The first says how far MLflow has taken the second: it is read
 before it and written after it, so that the copy never says that more was taken than it holds."""
 MOST_RECORDS = 2**30
@@ -25,9 +27,9 @@ FAREWELL_SECONDS = 60.0
 class Replica:
     """The copy of one run's folder."""
 
-    def __init__(self, folder: Path, storage: Storage) -> None:
-        """Name the copy ``runs/NAME``; nothing is written yet."""
-        self._folder, self._storage, self._name = folder, storage, f"runs/{folder.name}"
+    def __init__(self, folder: Path, storage: Storage, place: str = "runs") -> None:
+        """Name the copy as the folder, in the folder `place` of the storage; nothing is written yet."""
+        self._folder, self._storage, self._name = folder, storage, f"{place}/{folder.name}"
         self._copied: dict[str, tuple[float, int]] = {}
 
     def copy(self) -> None:
@@ -106,7 +108,9 @@ def restored(folder: Path) -> bool:
 
 
 @contextmanager
-def replicated(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
+def replicated(
+    folder: Path, say: Callable[[str], None], place: str = "runs", *, restore: bool = False
+) -> Iterator[None]:
     """Keep a copy of a run's folder while the run goes on, if ``DMIL_STORAGE`` names a storage.
 
     A storage that does not answer never stops a run; the copy is brought up to date when it answers again.
@@ -114,6 +118,8 @@ def replicated(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
     Args:
         folder: of the run.
         say: where messages go: one when the storage fails, one if the copy is not whole at the end.
+        place: the folder of the storage that the copy is in.
+        restore: fetch beforehand what the storage has further.
 
     Raises:
         StorageError: if the URL names no storage.
@@ -122,7 +128,7 @@ def replicated(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
     if storage is None:
         yield
         return
-    replica, closing, complained = Replica(folder, storage), threading.Event(), threading.Event()
+    replica, closing, complained = Replica(folder, storage, place), threading.Event(), threading.Event()
 
     def copied() -> bool:
         try:
@@ -138,6 +144,12 @@ def replicated(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
         while not closing.wait(SECONDS):
             copied()
 
+    if restore:
+        try:
+            if replica.restore():
+                say(f"{folder}: fetched from {storage.url}")
+        except Exception as error:  # noqa: BLE001  as above
+            say(f"{storage.url} does not give {folder} ({type(error).__name__}: {error}); going on without")
     thread = threading.Thread(target=work, name="replica", daemon=True)
     thread.start()
     try:

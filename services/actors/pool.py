@@ -38,8 +38,11 @@ class Pool:
         ahead: int = 1,
         say: Callable[[str], None] = lambda words: None,
         witness: Witness | None = None,
+        enough: int | None = None,
     ) -> None:
-        """Start `size` actors and wait until all are up.
+        """Start `size` actors and wait until `enough` are up; the others join whenever there is room for them.
+
+        An actor that waits for room is what makes a cluster grow, if it does so by itself.
 
         Args:
             make: starts one.
@@ -47,9 +50,10 @@ class Pool:
             ahead: calls that an actor may hold at a time. With 2 it has its next one at hand when it ends one.
             say: is told of actors lost, slow and replaced, in words.
             witness: is told so too, to count them.
+            enough: how many have room now; all by default.
 
         Raises:
-            NoRoomError: if the cluster cannot place them.
+            NoRoomError: if the cluster cannot place that many.
         """
         self._make, self._ahead, self._say, self._witness = make, ahead, say, witness or Witness()
         self._workers: list[Worker] = []
@@ -64,7 +68,7 @@ class Pool:
         """How many actors died or were ended for slowness, and replaced."""
         self.grow(size)
         until = time.monotonic() + PLACEMENT_SECONDS
-        while self._starting:
+        while len(self) < (size if enough is None else min(enough, size)):
             self._settle([])
             if time.monotonic() > until:
                 self.close()

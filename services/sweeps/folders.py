@@ -22,7 +22,7 @@ from services.digests import sha256
 from services.disk import inside, read_file, write_file
 from services.sweeps.settings import PlannedTrial, Size, Sweep, planned
 
-__all__ = ["MARK", "SweepError", "SweepFolder", "SweepRecord", "TrialResult", "evaluated", "trained"]
+__all__ = ["MARK", "TRAINED", "SweepError", "SweepFolder", "SweepRecord", "TrialResult", "evaluated", "trained"]
 
 Record = TypeVar("Record", bound=BaseModel)
 MOST_BYTES = 2**22

@@ -20,10 +20,12 @@ from services.disk import read_file, write_file
 from services.experiment import Experiment
 from services.progress import Clock, console
 from services.ray_runner import RayRunner
+from services.replica import replicated
 from services.reporting.records import read_metrics
 from services.results import EpisodeResult, read_rows
+from services.storage import given_storage
 from services.summary import cells, rates
-from services.sweeps.folders import SweepFolder, TrialResult, evaluated, trained
+from services.sweeps.folders import TRAINED, SweepFolder, TrialResult, evaluated, trained
 from services.sweeps.settings import PlannedTrial
 from services.tracking import Tracker, introduce
 
@@ -63,7 +65,7 @@ def tracker_of(sweep: SweepFolder, trial: PlannedTrial, kind: type[Tracker] = Tr
     return kind(folder, f"dmil-{sweep.record.name}", say, parent=sweep.path)
 
 
-def run_trial(folder: Path, name: str, demonstrations: Path, mlflow: str) -> None:
+def run_trial(folder: Path, name: str, demonstrations: Path, environment: Mapping[str, str]) -> None:
     """Run a trial to its end, or from where it was stopped, and note what came of it.
 
     An error in it is noted and tracked, and is no failure to Tune, which would only try again. If the process dies,
@@ -73,10 +75,10 @@ def run_trial(folder: Path, name: str, demonstrations: Path, mlflow: str) -> Non
         folder: of the sweep.
         name: of the trial.
         demonstrations: root of their store.
-        mlflow: address of MLflow.
+        environment: variables that it has of the sweep's program, as the addresses of MLflow and of a storage.
     """
     torch.set_num_threads(1)
-    os.environ["MLFLOW_TRACKING_URI"] = mlflow
+    os.environ |= environment
     sweep = SweepFolder(folder)
     trial = sweep.trials[name]
     tracker = tracker_of(sweep, trial, ReportingTracker)
@@ -87,7 +89,7 @@ def run_trial(folder: Path, name: str, demonstrations: Path, mlflow: str) -> Non
         try:
             introduce(tracker, trial.config)
             tracker.tags({"sweep": sweep.record.name, "variant": trial.variant, "scale": sweep.record.size})
-            sweep.finish(name, _run(sweep, trial, DemoStore(demonstrations), tracker))
+            sweep.finish(name, _run(sweep, trial, DemoStore(demonstrations, given_storage()), tracker))
             status = "FINISHED"
         except Exception as error:  # noqa: BLE001  whatever it is, it is shown, and the other trials go on
             status = "FAILED"
@@ -113,17 +115,18 @@ def _run(sweep: SweepFolder, trial: PlannedTrial, store: DemoStore, tracker: Tra
         tracker.tags({"trained": home.name})
         clock.lap("collect")
         with FileLock(home / ".lock"):  # two sweeps may want it
-            checkpoints = Checkpoints(home / "checkpoints", config.training.checkpoints_kept)
-            checkpoint = _whole(checkpoints, config.training.iterations)
-            if checkpoint is None:
-                write_file(home / "config.json", config.model_dump_json(indent=1) + "\n")
-                newest = checkpoints.newest() if checkpoints.all() else None
-                checkpoint = experiment.train(runner, data, checkpoints, tracker, newest, overlap_evaluation=False)
-                curves = read_metrics(sweep.of_trial(trial.name))
-                write_file(home / "metrics.json", _METRICS.dump_json(curves))
-            else:
-                console.print(f"trained already: {home}")
-                _copy_curves(home / "metrics.json", tracker)
+            with replicated(home, partial(console.print, markup=False), TRAINED, restore=True):
+                checkpoints = Checkpoints(home / "checkpoints", config.training.checkpoints_kept)
+                checkpoint = _whole(checkpoints, config.training.iterations)
+                if checkpoint is None:
+                    write_file(home / "config.json", config.model_dump_json(indent=1) + "\n")
+                    newest = checkpoints.newest() if checkpoints.all() else None
+                    checkpoint = experiment.train(runner, data, checkpoints, tracker, newest, overlap_evaluation=False)
+                    curves = read_metrics(sweep.of_trial(trial.name))
+                    write_file(home / "metrics.json", _METRICS.dump_json(curves))
+                else:
+                    console.print(f"trained already: {home}")
+                    _copy_curves(home / "metrics.json", tracker)
             clock.lap("train")
             tasks = [task for split, task in experiment.tasks if split in sweep.record.sweep.splits]
             folders = {}

@@ -1,6 +1,7 @@
 """The trials of a sweep on Ray Tune: which run beside each other, which are stopped early, how far they are."""
 
 import logging
+import os
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from services.actors.faults import NoRoomError
 from services.cluster import cpus
 from services.demo_store import data_root
 from services.progress import Bar, console
+from services.storage import STORAGE
 from services.sweeps.folders import SweepFolder, TrialResult
 from services.sweeps.trial import HELD_OUT, ITERATION, run_trial, tracker_of
 from services.tracking import tracking_uri
@@ -114,10 +116,13 @@ def tune_trials(sweep: SweepFolder) -> None:
         )
     for name in left:
         (sweep.of_trial(name) / "result.json").unlink(missing_ok=True)
-    folder, root, mlflow = sweep.path.absolute(), data_root().absolute(), _everywhere(tracking_uri())
+    folder, root = sweep.path.absolute(), data_root().absolute()
+    environment = {"MLFLOW_TRACKING_URI": _everywhere(tracking_uri())}
+    if STORAGE in os.environ:
+        environment[STORAGE] = os.environ[STORAGE]
 
     def trial(config: dict[str, Any]) -> None:
-        run_trial(folder, config["trial"], root, mlflow)
+        run_trial(folder, config["trial"], root, environment)
 
     # The trial's own process waits for its workers: they have the CPUs.
     bundles = [{"CPU": 1.0, **({"GPU": resources.gpus} if resources.gpus else {})}] * resources.workers

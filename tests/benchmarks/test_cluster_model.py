@@ -4,10 +4,19 @@ import math
 
 import pytest
 
-from benchmarks.cluster_model import Costs, Network, calls_of_a_tree, predict
+from benchmarks.cluster_model import Costs, Network, calls_of_a_tree, predict, seconds_of_a_tree
 
 COSTS = Costs(
-    slot=1.0, spread=0.0, step=0.25, call=0.5, submit=0.001, buffer=1000, store=1000.0, add=4000.0
+    slot=1.0,
+    spread=0.0,
+    step=0.25,
+    call=0.5,
+    submit=0.001,
+    buffer=1000,
+    store=1000.0,
+    add=4000.0,
+    demonstrations=0,
+    resident=0,
 )  # exact in binary, so that sums are too
 NETWORK = Network(workers_per_node=2, bytes_per_second=1000.0, latency=1.0)
 
@@ -34,8 +43,8 @@ def test_a_node_fetches_parameters_once_and_its_gradients_stay_on_it():
 
 def test_relaying_turns_the_number_of_nodes_into_its_logarithm():
     for workers, hops in ((2, 0), (4, 1), (16, 3), (64, 5)):
-        assert predict(COSTS, NETWORK, workers, 1, 8, relayed=True).broadcast == 1.5 + 2 * hops
-        assert predict(COSTS, NETWORK, workers, 1, 8, relayed=False).broadcast == 1.5 + 2 * (workers // 2 - 1)
+        assert predict(COSTS, NETWORK, workers, workers, 8, relayed=True).broadcast == 1.5 + 2 * hops
+        assert predict(COSTS, NETWORK, workers, workers, 8, relayed=False).broadcast == 1.5 + 2 * (workers // 2 - 1)
 
 
 def test_the_driver_is_slowest_in_the_end():
@@ -48,3 +57,21 @@ def test_the_driver_is_slowest_in_the_end():
 def test_more_workers_wait_longer_for_the_slowest():
     waits = [predict(COSTS._replace(spread=0.1), NETWORK, n, n, 8, relayed=True).waiting for n in (1, 2, 1000)]
     assert waits == [0, 0.1 * math.sqrt(2 * math.log(2)), 0.1 * math.sqrt(2 * math.log(1000))]
+
+
+def test_workers_without_a_group_of_slots_do_nothing():
+    ten = predict(COSTS, NETWORK, 10, 10, 8, relayed=True)
+    assert predict(COSTS, NETWORK, 1000, 10, 8, relayed=True) == ten
+    assert (ten.workers, ten.compute) == (10, 1.0)
+
+
+def test_a_worker_computes_the_slots_of_a_group_together():
+    assert predict(COSTS, NETWORK, 10, 10, 8, relayed=True, together=5)[:3:2] == (2, 5.0)
+    assert predict(COSTS, NETWORK, 1, 10, 8, relayed=True, together=5).compute == 10.0
+    assert predict(COSTS, NETWORK, 1, 3, 8, relayed=True, together=5).compute == 3.0
+
+
+def test_a_tree_of_additions_beats_one_process_that_fetches_all():
+    tree, alone = (seconds_of_a_tree(COSTS, NETWORK, 64, fan_in) for fan_in in (8, 64))
+    assert tree == 2 * (7 * 2.0 + 8 * 0.25 + 1.5) + 2.0
+    assert alone == 63 * 2.0 + 64 * 0.25 + 1.5 + 2.0

@@ -54,7 +54,7 @@ def test_simulation(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.alone
 def test_scaling(tmp_path: Path) -> None:
-    rows = rows_of("scaling", "--sizes", "quick", "--rounds", "1", "--simulate", "100", folder=tmp_path)
+    rows = rows_of("scaling", "--sizes", "quick", "--rounds", "1", folder=tmp_path)
     assert [(row["runner"], row["workers"], row["size"]) for row in rows] == [
         ("local", 1, "quick"),
         ("ray", 1, "quick"),
@@ -63,6 +63,21 @@ def test_scaling(tmp_path: Path) -> None:
     for row in rows:
         assert 0 <= row["overhead_share"] < 1
         assert row["speedup"] == pytest.approx(row["iterations_per_s"] / rows[1]["iterations_per_s"])
+
+
+@pytest.mark.slow
+@pytest.mark.alone
+def test_sizing(tmp_path: Path) -> None:
+    given = ("--presets", "ml10-quick", "--rounds", "1", "--workers", "1", "2", "1000")
+    rows = rows_of("sizing", *given, folder=tmp_path)
+    fixed, each = rows[:3], rows[3:]
+    assert [(row["workers"], row["used"], row["slots"]) for row in fixed] == [(1, 1, 10), (2, 2, 10), (1000, 2, 10)]
+    assert [(row["workers"], row["used"], row["slots"]) for row in each] == [(1, 1, 5), (2, 2, 10), (1000, 1000, 5000)]
+    one, two, thousand = fixed
+    assert thousand["iteration"] == two["iteration"] < one["iteration"] == pytest.approx(one["hours"] * 3600 / 4000)
+    assert (one["efficiency"], thousand["dollars"]) == (1, pytest.approx(500 * two["dollars"]))
+    assert each[2]["sent"] > each[0]["sent"] == 0
+    assert 0 < each[2]["tree"] < each[2]["alone"]
 
 
 @pytest.mark.slow

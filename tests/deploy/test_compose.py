@@ -1,5 +1,6 @@
 """The compose file: what Docker Compose says, and that its services find each other and let nobody else in."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -116,7 +117,26 @@ def test_the_head_asks_for_a_token():
         environment = services()[name]["environment"]
         assert environment["RAY_AUTH_MODE"] == "token"
         assert environment["RAY_AUTH_TOKEN_PATH"] == "/run/secrets/ray_token"
-        assert [secret["source"] for secret in services()[name]["secrets"]] == ["ray_token"]
+        assert {secret["source"] for secret in services()[name]["secrets"]} == {"ray_token", "storage_credentials"}
+
+
+def test_runs_are_copied_to_a_bucket_that_is_made_and_opens_to_their_keys_alone(tmp_path: Path, make_secrets):
+    buckets = services()["bucket"]["command"][2:]
+    make_secrets(tmp_path)
+    identities = {found["name"]: found for found in json.loads((tmp_path / "store.json").read_text())["identities"]}
+    (keys,) = identities["dmil"]["credentials"]
+    drawn = (tmp_path / "storage_credentials").read_text()
+    for name in ("head", "worker"):
+        environment = services()[name]["environment"]
+        bucket = environment["DMIL_STORAGE"].removeprefix("s3://")
+        assert bucket in buckets
+        assert identities["dmil"]["actions"] == [f"{action}:{bucket}" for action in ("Read", "Write", "List")]
+        assert environment["AWS_ENDPOINT_URL_S3"] == services()["mlflow"]["environment"]["MLFLOW_S3_ENDPOINT_URL"]
+        assert environment["AWS_SHARED_CREDENTIALS_FILE"] == "/run/secrets/storage_credentials"
+        assert {"storage"} < set(services()[name]["networks"])
+    assert keys["accessKey"] in drawn
+    assert keys["secretKey"] in drawn
+    assert keys["accessKey"] not in (tmp_path / "store_credentials").read_text()
 
 
 @pytest.mark.parametrize("name", sorted(services()))
@@ -173,6 +193,6 @@ def test_head_and_workers_see_the_same_folders():
 
 
 def test_the_database_and_the_store_are_out_of_reach():
-    assert composed()["networks"]["records"]["internal"] is True
-    for name in ("postgres", "store"):
-        assert list(services()[name]["networks"]) == ["records"]
+    for name, network in (("postgres", "records"), ("store", "storage")):
+        assert composed()["networks"][network]["internal"] is True
+        assert list(services()[name]["networks"]) == [network]

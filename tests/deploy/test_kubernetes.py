@@ -2,6 +2,7 @@
 
 import copy
 import json
+import os
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -294,3 +295,22 @@ def test_claims_are_made():
     claims = set(of_kind("PersistentVolumeClaim"))
     named = set(re.findall(r'"claimName": "([\w-]+)"', json.dumps(list(overlay("cpu")))))
     assert named == claims
+
+
+def test_an_overlay_with_the_object_store_tells_every_ray_pod_of_it(tmp_path: Path):
+    base, component = (os.path.relpath(DEPLOY / "kuberay" / part, tmp_path) for part in ("cpu", "object-store"))
+    (tmp_path / "kustomization.yaml").write_text(
+        yaml.safe_dump({"namespace": "dmil", "resources": [base], "components": [component]})
+    )
+    found = rendered(tmp_path)
+    (cluster,) = [document for document in found if document["kind"] == "RayCluster"]
+    assert against_kuberay(cluster) == []
+    for group in (cluster["spec"]["headGroupSpec"], *cluster["spec"]["workerGroupSpecs"]):
+        (container,) = group["template"]["spec"]["containers"]
+        assert {"name": "DMIL_STORAGE", "value": "s3://BUCKET/dmil"} in container["env"]
+        assert container["envFrom"] == [{"secretRef": {"name": "object-store"}}]
+    (policy,) = [document for document in found if document["metadata"]["name"] == "object-store"]
+    assert policy["spec"]["egress"] == [{"ports": [{"port": 443, "protocol": "TCP"}]}]
+    assert selected(policy["spec"]["podSelector"], containers(found))
+    code, output = against_kubernetes([policy], tmp_path / "core")
+    assert code == 0, output

@@ -169,11 +169,12 @@ def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[Nodes]:
 
 @pytest.mark.slow
 @pytest.mark.alone
-def test_nodes_may_leave_and_join(config: ExperimentConfig, store: DemoStore, data, nodes: Nodes):
+@pytest.mark.parametrize("asked", [None, 4])
+def test_nodes_may_leave_and_join(config: ExperimentConfig, store: DemoStore, data, nodes: Nodes, asked: int | None):
     several = Experiment(training(config, 7, 1), store)
     wanted = alone(several, data)
     leaving = nodes.add_node(num_cpus=1, object_store_memory=100_000_000)
-    with open_runner("ray", several.suite, None) as runner:
+    with open_runner("ray", several.suite, asked) as runner:
         assert runner.workers == 3
         meta_training = runner.meta_train(plan_of(several, data))
         assert isinstance(meta_training, RayMetaTraining)
@@ -185,7 +186,7 @@ def test_nodes_may_leave_and_join(config: ExperimentConfig, store: DemoStore, da
                 time.sleep(0.2)
 
         def joined() -> bool:
-            meta_training._pool.grow(runner.workers)
+            meta_training._pool.grow(meta_training._wanted)
             meta_training._pool.take_note()
             return len(meta_training) == 4
 

@@ -1,6 +1,7 @@
 """Sweeps as a user runs them: real Tune, real MLflow, real deaths."""
 
 import json
+import shutil
 import signal
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -17,6 +18,7 @@ from services import tune_sweep
 from services.checkpoints import Checkpoint, Checkpoints
 from services.demo_store import TaskDemonstrations, open_store
 from services.experiment import Experiment, open_runner
+from services.storage import STORAGE
 from services.sweeps.folders import SweepFolder
 from services.tracking import Tracker
 
@@ -174,6 +176,27 @@ def test_a_killed_sweep_goes_on_where_it_was(
     for child in children:
         assert child.info.status == "FINISHED"
         assert steps_of(mlflow_file, child, "gradient_norm") == list(range(1, 41))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("joined")
+def test_what_a_sweep_trained_is_fetched_elsewhere(programs, workplace: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv(STORAGE, (tmp_path / "storage").as_uri())
+    file = write_sweep({"DMIL": {}}, settings={"training": {"iterations": 4, "checkpoint_every": 2}})
+
+    def trained() -> tuple[str, bytes, str]:
+        code, printed = programs("tune_sweep", file, "--scale", "smoke", "--name", "once")
+        assert code == 0, printed
+        (home,), (log,) = workplace.glob("runs/trained/*"), workplace.glob("runs/once/trials/*/log.txt")
+        return newest(home).digest, (home / "metrics.json").read_bytes(), log.read_text()
+
+    digest, curves, told = trained()
+    assert "trained already" not in told
+    shutil.rmtree(workplace / "runs")
+    again = trained()
+    assert again[:2] == (digest, curves)
+    assert f"fetched from {(tmp_path / 'storage').as_uri()}" in again[2]
+    assert "trained already" in again[2]
 
 
 def newest(home: Path) -> Checkpoint:
