@@ -164,7 +164,7 @@ def draw_episodes(seen: Sequence[Seen], measure: Measure, best_score: int) -> Pi
                 steps = np.arange(1, len(course) + 1)
                 label = f"{word} ({len(kinds[success])})" if place == 0 else None
                 drawing: dict[str, Any] = {"drawstyle": "steps-post"} if scored else {}
-                axis.plot(steps, course, label=label, markevery=[-1], linewidth=1, alpha=0.8, **style, **drawing)
+                axis.plot(steps, course, label=label, markevery=[-1], linewidth=1.2, **style, **drawing)
         axis.set(xlabel="step", ylabel=measure.words, xlim=(0, None))
         if scored:
             axis.set(ylim=(-0.1, best_score * 1.1))
