@@ -76,7 +76,7 @@ def open_contest(checkpoint: Checkpoint, experiment: Experiment, folder: Path) -
         champion = client.get_model_version_by_alias(name, ALIAS) if has_one else None
         if champion is None or champion.source == _address(challenger.model_id):
             return Contest(client, uri, experiment, challenger, champion, None, folder)
-        rival = Checkpoint(_downloaded(champion, uri, folder / "model"))
+        rival = Checkpoint(_downloaded(client, champion, uri, folder / "model"))
     theirs = open_suite(rival.manifest.config.suite).protocol
     if theirs != experiment.suite.protocol:
         raise PromotionError(
@@ -110,13 +110,14 @@ def _address(model_id: str) -> str:
     return f"models:/{model_id}"
 
 
-def _downloaded(version: "ModelVersion", uri: str, folder: Path) -> Path:
+def _downloaded(client: "MlflowClient", version: "ModelVersion", uri: str, folder: Path) -> Path:
     """Return the folder of a version's checkpoint: none of a model's code is run."""
     from mlflow.artifacts import download_artifacts
 
     folder.mkdir(parents=True, exist_ok=True)
-    model = download_artifacts(artifact_uri=version.source, dst_path=str(folder), tracking_uri=uri)
-    return checkpoint_in(Path(model))
+    # Not by its address: that is looked up at the process's MLflow, which may be another.
+    place = client.get_logged_model((version.source or "").removeprefix(_address(""))).artifact_location
+    return checkpoint_in(Path(download_artifacts(artifact_uri=place, dst_path=str(folder), tracking_uri=uri)))
 
 
 @dataclass(frozen=True)

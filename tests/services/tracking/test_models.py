@@ -1,6 +1,7 @@
 """The logged model does what the method does here, without a pickle, and says what is wrong with its input."""
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from mlflow import MlflowClient
+from mlflow.artifacts import download_artifacts
 from mlflow.pyfunc.model import PythonModelContext
 
 from dmil_core.configs import preset_of
@@ -21,6 +23,7 @@ from services.demo_store import DemoStore
 from services.experiment import Experiment
 from services.runners import LocalRunner
 from services.tracking import Tracker
+from services.tracking.delivery import Identity
 from services.tracking.imitator import POLICIES_KEPT, Imitator
 from services.tracking.models import checkpoint_in, models_of
 from services.tracking.packing import PackingError, packed
@@ -73,23 +76,34 @@ def test_it_acts_as_the_adapted_policy_step_by_step(untrained, method: str):
         assert remembered == memory[0].tolist()
 
 
-def test_mlflow_loads_it_without_pickle_and_predicts(untrained, mlflow_file: str, tmp_path: Path, monkeypatch):
-    checkpoint, support = untrained("dmil")
+@pytest.fixture
+def own_mlflow(mlflow_file: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """MLflow itself is told where it is, as a user does, and forgets it after the test."""
     monkeypatch.setenv("MLFLOW_TRACKING_URI", mlflow_file)
+    yield mlflow_file
+    mlflow.set_tracking_uri(None)  # pyright: ignore[reportArgumentType]  so it is forgotten
+
+
+def test_mlflow_loads_it_without_pickle_and_predicts(untrained, own_mlflow: str, tmp_path: Path, monkeypatch):
+    checkpoint, support = untrained("dmil")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", own_mlflow)
     for _ in range(2):  # the second one finds it there
         tracker = Tracker(tmp_path, "models", print)
         tracker.model(checkpoint.path, support[:1])
         assert tracker.close("FINISHED")
-    client = MlflowClient(mlflow_file)
-    (model,) = models_of(client, client.get_run(str(tracker.run_id)))
+    run_id = Identity.of(tmp_path).run_id
+    client = MlflowClient(own_mlflow)
+    (model,) = models_of(client, client.get_run(str(run_id)))
     monkeypatch.setenv("MLFLOW_ALLOW_PICKLE_DESERIALIZATION", "false")
-    mlflow.set_tracking_uri(mlflow_file)
-    loaded = mlflow.pyfunc.load_model(f"runs:/{tracker.run_id}/model")
-    folder = Path(mlflow.artifacts.download_artifacts(f"models:/{model.model_id}", dst_path=str(tmp_path / "m")))
+    loaded = mlflow.pyfunc.load_model(f"runs:/{run_id}/model")
+    folder = Path(download_artifacts(f"models:/{model.model_id}", dst_path=str(tmp_path / "m")))
     assert not [path for path in folder.rglob("*") if path.suffix in {".pkl", ".pickle", ".pt"}]
     assert Checkpoint(checkpoint_in(folder)).digest == checkpoint.digest
-    assert set(loaded.metadata.get_input_schema().input_names()) == {"support", "observation", "memory"}
-    assert set(loaded.metadata.get_output_schema().input_names()) == {"action", "sub_skill", "memory"}
+    inputs, outputs = loaded.metadata.get_input_schema(), loaded.metadata.get_output_schema()
+    assert inputs is not None
+    assert outputs is not None
+    assert inputs.input_names() == ["support", "observation", "memory"]
+    assert outputs.input_names() == ["action", "sub_skill", "memory"]
 
     observation = support[0].observations[5]
     params = {"fine_tuning_steps": STEPS.steps, "learning_rate": STEPS.learning_rate}
@@ -100,12 +114,11 @@ def test_mlflow_loads_it_without_pickle_and_predicts(untrained, mlflow_file: str
     (shown,) = loaded.predict(loaded.input_example, params=params)
     assert len(shown["action"]) == 4
     (snippet,) = re.findall(r"```python\n(.*?)```", GUIDE.read_text(), re.DOTALL)
-    at = snippet.replace("models:/ml10@champion", f"models:/{model.model_id}").replace(
-        "sqlite:///mlflow.db", mlflow_file
-    )
-    assert at.count(model.model_id) == at.count(mlflow_file) == 1
+    for placeholder, own in (("ml10@champion", model.model_id), ("sqlite:///mlflow.db", own_mlflow)):
+        assert snippet.count(placeholder) == 1
+        snippet = snippet.replace(placeholder, own)
     told: dict[str, Any] = {}
-    exec(at, told)
+    exec(snippet, told)
     assert (len(told["action"]), told["memory"]) == (4, [])
     with pytest.raises(PackingError, match=r"observation: got the shape \(2,\); wanted 39 numbers"):
         loaded.predict(packed(support, observation[:2]))

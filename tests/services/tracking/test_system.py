@@ -8,6 +8,7 @@ from mlflow import MlflowClient
 
 from services.reporting.records import read_metrics
 from services.tracking import Tracker, system
+from services.tracking.delivery import Identity
 from services.tracking.system import recording_system
 from tests.services.tracking.conftest import records
 
@@ -28,7 +29,7 @@ def test_samples_go_to_mlflow_as_its_system_metrics_and_a_resumed_run_goes_on_co
     assert [sample.step for sample in samples] == list(range(len(samples)))
     names = {"cpu_utilization_percentage", "system_memory_usage_megabytes", "disk_usage_percentage"}
     assert all(0 <= sample.values["system/cpu_utilization_percentage"] <= 100 for sample in samples)
-    metrics = MlflowClient(mlflow_file).get_run(str(tracker.run_id)).data.metrics
+    metrics = MlflowClient(mlflow_file).get_run(str(Identity.of(tmp_path).run_id)).data.metrics
     assert metrics.keys() >= {f"system/{name}" for name in (*names, "network_receive_megabytes")}
     assert read_metrics(tmp_path) == [{"iteration": 1, "loss": 0.5}], "they are no metrics of iterations"
 
