@@ -11,11 +11,12 @@ from pathlib import Path
 import tyro
 
 from dmil_core.configs import EvaluationConfig
+from services.champions import ALIAS, open_contest
 from services.checkpoints import Checkpoint, Checkpoints
-from services.command_line import Quiet, exit_code, parse, peek, with_evaluation
+from services.command_line import ConfigError, Quiet, exit_code, parse, peek, with_evaluation
 from services.demo_store import open_store
 from services.experiment import Experiment, RunnerKind, open_runner
-from services.progress import Clock
+from services.progress import Clock, console
 from services.report import show, write_report
 from services.summary import summarise
 
@@ -37,6 +38,10 @@ class Arguments:
     """Where to work: in Ray actors, or in this process; the result is the same."""
     workers: int | None = None
     """Ray workers, one for each CPU of the cluster if not given."""
+    promote: bool = False
+    """Register the run's model in MLflow under the suite's name, and give it the alias champion if it is the first, or
+    better than the champion outside the interval of their difference: the champion is then evaluated too, in the same
+    episodes."""
     quiet: Quiet = False
 
 
@@ -51,19 +56,27 @@ def run(arguments: Sequence[str]) -> None:
     given = parse(Arguments, __doc__ or "", arguments, Arguments(path, checkpoint.manifest.config.evaluation))
     config = with_evaluation(checkpoint.manifest.config, given.evaluation)
     if given.tasks is not None:
+        if given.promote:
+            raise ConfigError("--promote: got --tasks with it; wanted all of the suite's, by which models are compared")
         config = config.model_copy(update={"suite": config.suite.model_copy(update={"test_tasks": given.tasks})})
     experiment = Experiment(config, open_store())
     given.output.mkdir(parents=True, exist_ok=True)
+    contest = open_contest(checkpoint, experiment, given.output / ALIAS) if given.promote else None
     clock = Clock()
     with open_runner(given.runner, experiment.suite, given.workers) as runner:
         clock.lap("start")
         data = experiment.collect(runner)
         clock.lap("collect")
         evaluation = experiment.evaluate(runner, data, checkpoint, given.output, given.tasks)
+        if contest is not None:
+            contest.evaluate_rival(runner, data)
         clock.lap("evaluate")
     summary = summarise(evaluation, seconds=clock.seconds, folder=given.output)
     write_report(summary, given.output)
     show(summary)
+    if contest is not None:
+        for line in contest.settle(evaluation, given.output):
+            console.print(line, markup=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

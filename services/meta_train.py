@@ -30,6 +30,7 @@ from services.reporting.finished import FinishedRun
 from services.storage import STORAGE
 from services.summary import summarise
 from services.tracking import Tracker, introduce
+from services.tracking.system import recording_system
 
 __all__ = ["Arguments", "run"]
 
@@ -95,7 +96,7 @@ def _carry_out(given: Arguments, folder: Path, checkpoint: Checkpoint | None) ->
     status = "FAILED"
     try:
         introduce(tracker, config)
-        with open_runner(given.runner, experiment.suite, given.workers) as runner:
+        with recording_system(tracker), open_runner(given.runner, experiment.suite, given.workers) as runner:
             clock.lap("start")
             data = experiment.collect(runner)
             tracker.inputs({dataset.id: dataset.digest for dataset in data.values()})
@@ -118,6 +119,7 @@ def _carry_out(given: Arguments, folder: Path, checkpoint: Checkpoint | None) ->
 
         write_run_page(FinishedRun(folder), folder / "report" / PAGE)
         publish(tracker, summary, folder)
+        tracker.model(trained.path, experiment.held_out_sets(data)[experiment.tasks[-1][1]][:1])
         status = "FINISHED"
     except KeyboardInterrupt:
         status = "KILLED"
@@ -125,7 +127,7 @@ def _carry_out(given: Arguments, folder: Path, checkpoint: Checkpoint | None) ->
         raise
     finally:
         tracker.close(status)
-    show(summary, tracker.uri)
+    show(summary, tracker.whereabouts)
 
 
 def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]:

@@ -12,7 +12,7 @@ from services.checkpoints import Checkpoint
 from services.command_line import ConfigError, exit_code
 from services.progress import console
 from services.summary import AGAINST_COLLAPSE, Summary, rates, table, table_markdown, write_summary
-from services.tracking import Tracker, redacted
+from services.tracking import Tracker
 
 __all__ = ["PAGE", "publish", "run", "show", "write_report"]
 
@@ -38,7 +38,7 @@ def write_report(summary: Summary, folder: Path) -> None:
 
 
 def publish(tracker: Tracker, summary: Summary, folder: Path) -> None:
-    """Record the success rates, of each task and in all, the report and the checkpoint on the MLflow run."""
+    """Record the success rates, of each task and in all, the report and the episodes on the MLflow run."""
     metrics = rates(summary.rows, summary.sub_skills)
     metrics |= {f"seconds/{phase}": spent for phase, spent in summary.seconds.items()}
     tracker.metrics(Checkpoint(Path(summary.checkpoint)).manifest.iteration, metrics, anew=True)
@@ -47,13 +47,12 @@ def publish(tracker: Tracker, summary: Summary, folder: Path) -> None:
         (folder / "report", "report"),
         (folder / "summary.json", None),
         (folder / "episodes.jsonl", None),
-        (Path(summary.checkpoint), "checkpoint"),
     ):
         tracker.artifact(path, destination)
 
 
-def show(summary: Summary, tracking_uri: str | None = None) -> None:
-    """Print the table, the use of sub-skills, the seconds, and where everything is."""
+def show(summary: Summary, whereabouts: Sequence[str] = ()) -> None:
+    """Print the table, the use of sub-skills, the seconds, and where everything is, the MLflow run too if given."""
     console.print(table(summary))
     for split, use in summary.sub_skills.items():
         shares = ", ".join(f"{share:.2f}" for share in use.share)
@@ -70,10 +69,8 @@ def show(summary: Summary, tracking_uri: str | None = None) -> None:
     console.print("seconds: " + ", ".join(f"{phase} {spent:.0f}" for phase, spent in summary.seconds.items()))
     page = Path(summary.report) / PAGE
     console.print(f"checkpoint: {summary.checkpoint}\nreport: {page if page.exists() else summary.report}")
-    if tracking_uri is not None:
-        console.print(f"MLflow run: {summary.mlflow_run_id or 'not there yet'} at {redacted(tracking_uri)}")
-        if tracking_uri.startswith("sqlite"):
-            console.print(f"to look at it: mlflow ui --backend-store-uri {tracking_uri} --host 127.0.0.1")
+    for line in whereabouts:
+        console.print(line, markup=False, soft_wrap=True)
 
 
 def run(arguments: Sequence[str]) -> None:

@@ -29,7 +29,10 @@ from services.suites.registry import open_suite
 from services.sweeps.folders import MARK, SweepFolder, SweepRecord
 from services.sweeps.layout import publish, show, write_tables
 from services.sweeps.settings import Size, Sweep, planned
-from services.tracking import Tracker
+from services.tracking import Tracker, tracking_uri
+from services.tracking.delivery import IDENTITY, Identity
+from services.tracking.links import comparison_link
+from services.tracking.system import recording_system
 
 __all__ = ["Arguments", "run"]
 
@@ -67,7 +70,7 @@ def run(arguments: Sequence[str]) -> None:
     status = "FAILED"
     try:
         _introduce(tracker, sweep)
-        with joined():
+        with recording_system(tracker), joined():
             clock.lap("start")
             _collect(sweep)
             clock.lap("collect")
@@ -87,7 +90,8 @@ def run(arguments: Sequence[str]) -> None:
         tracker.close(status)
     show(tables, sweep)
     console.print("seconds: " + ", ".join(f"{phase} {spent:.0f}" for phase, spent in clock.seconds.items()))
-    console.print(f"MLflow run: {tracker.run_id or 'not there yet'} at {tracker.uri}")
+    for line in [*tracker.whereabouts, *_side_by_side(sweep)]:
+        console.print(line, markup=False, soft_wrap=True)
     if failed := [name for name in sweep.trials if (result := sweep.result(name)) and result.status == "failed"]:
         raise RunError(
             f"{len(failed)} of {len(sweep.trials)} trials failed, see above; the others are in the table; to try them "
@@ -159,6 +163,17 @@ def _introduce(tracker: Tracker, sweep: SweepFolder) -> None:
     tracker.parameters({"rows": ", ".join(settings.row_names), "trials": len(sweep.trials)})
     tracker.tags({"sweep": record.name, "scale": record.size, "suite": suites, "method": methods, "seed": seeds})
     tracker.tags({"git_commit": record.commit, "command": record.command})
+
+
+def _side_by_side(sweep: SweepFolder) -> list[str]:
+    """Return a line with the page that has the trials side by side, as far as MLflow knows them."""
+    folders = [sweep.of_trial(name) for name in sweep.trials]
+    trials = [Identity.of(folder) for folder in folders if (folder / IDENTITY).exists()]
+    runs = [trial.run_id for trial in trials if trial.run_id is not None]
+    experiment = next((trial.experiment_id for trial in trials if trial.experiment_id is not None), None)
+    if experiment is None:
+        return []
+    return [f"its trials side by side: {comparison_link(tracking_uri(), experiment, runs)}"]
 
 
 def _collect(sweep: SweepFolder) -> None:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import NamedTuple
 
-from services.tracking.spool import Measured, read_spool
+from services.tracking.spool import read_spool
 
 __all__ = ["Origin", "read_metrics", "read_origin"]
 
@@ -25,7 +25,7 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
     """
     by_step: dict[int, dict[str, float]] = {}
     for line in read_spool(folder / "tracking.jsonl"):
-        if isinstance(line.value, Measured):
+        if line.kind == "metrics":
             by_step.setdefault(line.value.step, {"iteration": line.value.step}).update(line.value.values)
     return [by_step[step] for step in sorted(by_step)]
 

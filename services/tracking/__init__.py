@@ -4,20 +4,25 @@ import os
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from dmil_core.configs import ExperimentConfig
+from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import RunError, UserError
 from services.provenance import git_commit, library_versions
 from services.tracking.delivery import Delivery, Identity
-from services.tracking.spool import Artifact, Ended, Measured, Spool
+from services.tracking.links import how_to_look, run_link
+from services.tracking.packing import packed
+from services.tracking.spool import Artifact, Ended, Example, Measured, Spool, Trained
 
 # A call that MLflow's client made again by itself could make a second run. A slow answer is no trouble for a thread.
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "60")
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")  # it would speak into the live screen
+os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
 
 __all__ = ["DEFAULT_URI", "Tracker", "in_words", "introduce", "redacted", "tracking_uri"]
 
@@ -25,6 +30,11 @@ DEFAULT_URI = "sqlite:///mlflow.db"
 RETRY_SECONDS = 10.0
 LINGER_SECONDS = 1.0
 """How long records are gathered before they are sent together."""
+SYSTEM = "system/"
+"""What MLflow's system metrics begin with."""
+DIGITS = 12
+"""Of a data set's digest, in a tag."""
+EXAMPLE_STEPS = 3
 FAREWELL_SECONDS = 3.0
 """How long the end of a run waits for an MLflow that has failed or been slow."""
 
@@ -83,6 +93,17 @@ class Tracker:
         return self._delivery.run_id
 
     @property
+    def whereabouts(self) -> list[str]:
+        """Lines that say where the MLflow run is, as far as it is known, and how to look at it."""
+        run_id, experiment_id, uri = self.run_id, self._delivery.experiment_id, tracking_uri()
+        lines = [f"MLflow run: {run_id or 'not there yet'} at {self.uri}"]
+        if (command := how_to_look(uri)) is not None:
+            lines.append(f"to look at it: {command}")
+        if run_id is not None and experiment_id is not None:
+            lines.append(f"its page: {run_link(uri, experiment_id, run_id)}")
+        return lines
+
+    @property
     def waiting(self) -> int:
         """How many records MLflow has not taken yet."""
         return self._spool.count - self._delivery.delivered
@@ -110,14 +131,33 @@ class Tracker:
         """Record tags; a later value replaces an earlier one."""
         self._spool.append("tags", dict(values))
 
+    def system(self, values: Mapping[str, float]) -> None:
+        """Record the next sample of the machine's load, under the names by which MLflow knows such metrics."""
+        named = {f"{SYSTEM}{name}": value for name, value in values.items()}
+        step = 1 + max((max(self._spool.measured[name], default=-1) for name in named), default=-1)
+        self._spool.append("system", Measured(step=step, time=_now(), values=named))
+
     def inputs(self, digests: Mapping[str, str]) -> None:
-        """Record data sets by name and digest as the run's inputs."""
+        """Record data sets by name and digest as the run's inputs, and in one tag, by which runs are found."""
         self._spool.append("inputs", dict(digests))
+        self.tags({"data": ", ".join(f"{name} {digest[:DIGITS]}" for name, digest in digests.items())})
 
     def artifact(self, path: Path, folder: str | None = None) -> None:
         """Record a file or folder below the run's folder as an artifact."""
         below = path.absolute().relative_to(self._folder.absolute())
         self._spool.append("artifact", Artifact(path=str(below), folder=folder))
+
+    def model(self, checkpoint: Path, support: Sequence[Demonstration]) -> None:
+        """Record a checkpoint below the run's folder as the run's model.
+
+        Args:
+            checkpoint: its folder.
+            support: demonstrations of one task, whose first steps are what the model shows as its example.
+        """
+        below = checkpoint.absolute().relative_to(self._folder.absolute())
+        parts = [demonstration.window(0, min(EXAMPLE_STEPS, len(demonstration))) for demonstration in support]
+        example = Example.model_validate(packed(parts, parts[0].observations[0]))
+        self._spool.append("model", Trained(checkpoint=str(below), example=example))
 
     def identify(self, patience: float = 20.0) -> str | None:
         """Return the MLflow run's id, or None if it is not known yet.
@@ -191,6 +231,7 @@ def introduce(tracker: Tracker, config: ExperimentConfig) -> None:
     """Record what a run is: every setting, the commit of the code and the versions of the libraries."""
     tracker.parameters(dict(_flat(config.model_dump(mode="json"), "")))
     tracker.tags({"suite": config.suite.name, "method": config.method.name, "seed": str(config.seed)})
+    tracker.tags({"shots": " ".join(map(str, config.evaluation.shots))})
     tracker.tags({"git_commit": git_commit(), **{f"version.{name}": v for name, v in library_versions().items()}})
 
 

@@ -1,4 +1,4 @@
-"""Deliver the records of a run to MLflow that it did not take while the run was on, or tell how many those are.
+"""Deliver to MLflow what it did not take while a run was on, tell how much that is, or deliver the report once more.
 
 MLflow is where MLFLOW_TRACKING_URI says, and else the file mlflow.db in this folder.
 """
@@ -14,20 +14,24 @@ from tyro.conf import Positional
 
 from dmil_core.errors import RunError, UserError
 from services.command_line import exit_code, parse
-from services.folders import find_folder
+from services.folders import FolderError, find_folder
 from services.progress import console
 from services.tracking import in_words, redacted, tracking_uri
 from services.tracking.delivery import Delivery
+from services.tracking.spool import Artifact, Spool
 
 __all__ = ["Arguments", "run"]
+
+REPORT = "report"
+"""In a run's folder, and among its artifacts."""
 
 
 @dataclass(frozen=True)
 class Arguments:
     """Arguments of ``tracking``."""
 
-    action: Positional[Literal["flush", "status"]]
-    """Deliver what waits, or tell what does."""
+    action: Positional[Literal["flush", "status", "report"]]
+    """Deliver what waits, tell what does, or deliver the folder report again, as it is after services.report."""
     run: Positional[str]
     """Name or folder of a run."""
     runs: Path = Path("runs")
@@ -44,6 +48,9 @@ def run(arguments: Sequence[str]) -> None:
     given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, tyro.MISSING))
     uri = tracking_uri()
     folder = find_folder(given.run, given.runs, "tracking.jsonl", "RUN")
+    if given.action == "report":
+        _report(folder, uri)
+        return
     for own in (folder, *sorted(spool.parent for spool in folder.glob("trials/*/tracking.jsonl"))):  # of a sweep
         delivery = Delivery(own, uri)
         try:
@@ -66,6 +73,23 @@ def _flush(delivery: Delivery, folder: Path, uri: str) -> None:
             "the MLflow that the run began with, and flush again"
         ) from None  # its text may hold secrets
     console.print(f"delivered: {delivery.delivered - before} of {waiting} records, MLflow run {delivery.run_id}")
+
+
+def _report(folder: Path, uri: str) -> None:
+    """Record the folder with the report of a run that is over once more, and deliver it."""
+    if not (folder / REPORT).is_dir():
+        raise FolderError(
+            f"RUN: got {folder}, which has no folder {REPORT}; wanted a finished run: python -m services.report run"
+        )
+    delivery = Delivery(folder, uri)
+    try:
+        _flush(delivery, folder, uri)  # nobody else delivers, and so records, from here on
+        spool = Spool(folder / "tracking.jsonl")
+        spool.append("artifact", Artifact(path=REPORT, folder=REPORT))
+        spool.close()
+        _flush(delivery, folder, uri)
+    finally:
+        delivery.close()
 
 
 def _status(delivery: Delivery) -> None:

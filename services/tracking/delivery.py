@@ -19,16 +19,22 @@ from services.tracking.spool import Line, read_spool
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-__all__ = ["RUN_TAG", "BusyError", "Delivery", "Identity", "IdentityError"]
+__all__ = ["IDENTITY", "RUN_TAG", "BusyError", "Delivery", "Identity", "IdentityError"]
 
 RUN_TAG = "dmil.run"
 """The tag by which a run is found again whose id was never noted."""
 PARENT_TAG = "mlflow.parentRunId"
 """MLflow's own, by which its pages nest runs."""
+KIND = {"mlflow.experimentKind": "custom_model_development"}
+"""So MLflow shows the pages for training, not those for applications of language models."""
 SLOW_SECONDS = 5.0
 """A server that takes longer for a call is not waited for."""
 OPENING_SECONDS = 20.0
 """A database has longer: on its first use MLflow makes its tables."""
+SENDING_SECONDS = 60.0
+"""So have files."""
+IDENTITY = "mlflow_run.json"
+"""In a run's folder."""
 IDENTITY_BYTES = 10_000
 
 
@@ -58,6 +64,8 @@ class Identity(BaseModel):
     parent: str | None = None
     """The tag of the run that this one is a trial of; it goes to the same MLflow experiment."""
     run_id: str | None = None
+    experiment_id: str | None = None
+    """Noted with the run's, but not in files of older versions."""
     delivered: int = 0
     """How many records MLflow has taken."""
 
@@ -68,7 +76,7 @@ class Identity(BaseModel):
         Raises:
             IdentityError: if there is none, or it is damaged.
         """
-        path = folder / "mlflow_run.json"
+        path = folder / IDENTITY
         try:
             return Identity.model_validate_json(read_file(path, IDENTITY_BYTES))
         except (OSError, ValidationError) as error:
@@ -90,7 +98,7 @@ class Identity(BaseModel):
         Raises:
             IdentityError: if it is damaged.
         """
-        path = folder / "mlflow_run.json"
+        path = folder / IDENTITY
         if not path.exists():
             made = Identity(
                 tag=uuid4().hex, experiment=experiment, name=folder.name, began=int(time.time() * 1000), parent=parent
@@ -116,7 +124,7 @@ class Delivery:
         self._folder, self._uri = folder, uri
         self._lock = FileLock(folder / "tracking.lock", thread_local=False)
         self._client: MlflowClient | None = None
-        self._limit = SLOW_SECONDS if uri.startswith("http") else OPENING_SECONDS
+        self._usual = self._limit = SLOW_SECONDS if uri.startswith("http") else OPENING_SECONDS
         self._asked: float | None = None
         self._was_slow = False
         self._identity = Identity.of(folder)
@@ -126,6 +134,11 @@ class Delivery:
     def run_id(self) -> str | None:
         """The MLflow run's id, as far as it is known."""
         return self._identity.run_id
+
+    @property
+    def experiment_id(self) -> str | None:
+        """The MLflow experiment's id, as far as it is known."""
+        return self._identity.experiment_id
 
     @property
     def delivered(self) -> int:
@@ -172,7 +185,7 @@ class Delivery:
         client, run_id = self._open()
         while waiting:
             batch = next_batch(waiting)
-            with self._asking():
+            with self._asking(SENDING_SECONDS if batch[0].kind in {"artifact", "model"} else None):
                 send(client, run_id, self._folder, batch)
             waiting = waiting[len(batch) :]
             # Records must not be noted as delivered that a power failure would take back.
@@ -215,8 +228,9 @@ class Delivery:
                 self._client = MlflowClient(self._uri)
         run_id = self.run_id
         if run_id is None:
-            run_id = self._run_in(self._client, self._experiment_in(self._client))
-            self._note(run_id=run_id)
+            experiment_id = self._experiment_in(self._client)
+            run_id = self._run_in(self._client, experiment_id)
+            self._note(run_id=run_id, experiment_id=experiment_id)
         return self._client, run_id
 
     def _experiment_in(self, client: "MlflowClient") -> str:
@@ -227,7 +241,7 @@ class Delivery:
         if found:
             return found.experiment_id
         with self._asking():
-            return client.create_experiment(name, artifact_location=_beside(self._uri))
+            return client.create_experiment(name, artifact_location=_beside(self._uri), tags=KIND)
 
     def _run_in(self, client: "MlflowClient", experiment_id: str) -> str:
         """Return the id of our run: of one that was made before its id could be noted, or of a new one."""
@@ -252,8 +266,9 @@ class Delivery:
         return found[0].info.run_id if found else None
 
     @contextmanager
-    def _asking(self) -> Iterator[None]:
-        """Take the time of a call, so that others can see how long it is out."""
+    def _asking(self, limit: float | None = None) -> Iterator[None]:
+        """Take the time of a call, so that others can see how long it is out, and whether that is longer than usual."""
+        self._limit = limit or self._usual
         self._asked = asked = time.monotonic()
         try:
             yield
@@ -263,7 +278,7 @@ class Delivery:
 
     def _note(self, **changed: Any) -> None:
         self._identity = self._identity.model_copy(update=changed)
-        write_file(self._folder / "mlflow_run.json", self._identity.model_dump_json())
+        write_file(self._folder / IDENTITY, self._identity.model_dump_json())
 
 
 def _problems(error: ValidationError) -> Iterator[str]:

@@ -5,7 +5,9 @@ from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from services.tracking.spool import Artifact, Ended, Line, Measured
+from services.checkpoints import Checkpoint, CheckpointError
+from services.tracking.models import log_model
+from services.tracking.spool import Artifact, Ended, Line, Measured, Trained
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -35,7 +37,7 @@ def send(client: "MlflowClient", run_id: str, folder: Path, batch: Sequence[Line
     kind, value = batch[0].kind, batch[0].value
     if kind == "begin":
         client.update_run(run_id, status="RUNNING")
-    elif kind == "metrics":
+    elif kind in {"metrics", "system"}:
         _send_metrics(client, run_id, [line.value for line in batch])
     elif kind == "parameters":
         _send_parameters(client, run_id, value)
@@ -45,6 +47,8 @@ def send(client: "MlflowClient", run_id: str, folder: Path, batch: Sequence[Line
         _send_inputs(client, run_id, value)
     elif kind == "artifact":
         _send_artifact(client, run_id, folder, value)
+    elif kind == "model":
+        _send_model(client, run_id, folder, value)
     elif kind == "end":
         _send_end(client, run_id, value)
 
@@ -92,6 +96,15 @@ def _send_artifact(client: "MlflowClient", run_id: str, folder: Path, value: Art
         return
     send = client.log_artifacts if path.is_dir() else client.log_artifact
     send(run_id, str(path), value.folder)
+
+
+def _send_model(client: "MlflowClient", run_id: str, folder: Path, value: Trained) -> None:
+    try:
+        checkpoint = Checkpoint(folder / value.checkpoint)
+    except CheckpointError as error:
+        _send_tags(client, run_id, {f"missing.{value.checkpoint}": str(error)[:5000]})
+    else:
+        log_model(client, run_id, checkpoint, value.example.model_dump())
 
 
 def _send_end(client: "MlflowClient", run_id: str, value: Ended) -> None:

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import threading
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, Validat
 from dmil_core.errors import UserError
 from services.disk import room_for
 
-__all__ = ["Line", "Measured", "Spool", "SpoolError", "read_spool"]
+__all__ = ["Artifact", "Ended", "Example", "Line", "Measured", "Spool", "SpoolError", "Trained", "read_spool"]
 
 
 LONGEST_LINE = 2**22
@@ -56,12 +57,27 @@ class Artifact(_Content):
     """Where it goes among the run's artifacts."""
 
 
+class Example(_Content):
+    """What a model may be asked, in the form of `services.tracking.packing`."""
+
+    support: list[dict[Literal["observations", "actions"], list[list[float]]]]
+    observation: list[float]
+
+
+class Trained(_Content):
+    """A checkpoint of the run that is its model."""
+
+    checkpoint: Annotated[str, AfterValidator(_below)]
+    example: Example
+
+
 Texts = dict[str, str]
 _RECORD: TypeAdapter[tuple[str, Any]] = TypeAdapter(
     tuple[Literal["begin"], None]
-    | tuple[Literal["metrics"], Measured]
+    | tuple[Literal["metrics", "system"], Measured]
     | tuple[Literal["parameters", "tags", "inputs"], Texts]
     | tuple[Literal["artifact"], Artifact]
+    | tuple[Literal["model"], Trained]
     | tuple[Literal["end"], Ended]
 )
 
@@ -125,24 +141,25 @@ class Spool:
             self.count, self._size = line.number, line.end
             if isinstance(line.value, Measured):
                 self._note(line.value)
+        self._lock = threading.Lock()
         self._file = path.open("ab", buffering=0)
         self._file.truncate(self._size)
 
     def append(self, kind: str, value: Any) -> None:
-        """Write one record, whole or not at all: a killed process loses none of those written.
+        """Write one record, whole or not at all, from any thread: a killed process loses none of those written.
 
         Raises:
             DiskFullError: for want of space.
         """
         content = value.model_dump() if isinstance(value, BaseModel) else value
         line = json.dumps([kind, content]).encode() + b"\n"
-        with room_for(self.path, len(line)):
+        with self._lock, room_for(self.path, len(line)):
             if self._file.write(line) < len(line):
                 self._file.truncate(self._size)
                 raise OSError(errno.ENOSPC, "No space left on device")
-        self.count, self._size = self.count + 1, self._size + len(line)
-        if isinstance(value, Measured):
-            self._note(value)
+            self.count, self._size = self.count + 1, self._size + len(line)
+            if isinstance(value, Measured):
+                self._note(value)
 
     def _note(self, measured: Measured) -> None:
         for name, value in measured.values.items():

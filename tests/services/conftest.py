@@ -1,5 +1,6 @@
 """What the tests of the service share: one small store of demonstrations, one Ray cluster, and the programs."""
 
+import os
 import shutil
 import signal
 import socket
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from playwright.sync_api import Browser, sync_playwright
 
 from dmil_core.configs import PRESETS, ExperimentConfig
 from services import meta_train
@@ -24,6 +26,7 @@ from services.experiment import Experiment, open_runner
 
 PROJECT = Path(__file__).parents[2]
 SECONDS_TO_START = 90
+CHROMIUM = shutil.which("chromium")
 
 
 @pytest.fixture(scope="session")
@@ -153,6 +156,53 @@ def workplace(tmp_path: Path, store: DemoStore, mlflow_file: str, monkeypatch: p
     monkeypatch.setenv("DMIL_DATA", str(store.root))
     monkeypatch.setenv("MLFLOW_TRACKING_URI", mlflow_file)
     return tmp_path
+
+
+class Server:
+    """A real MLflow server on loopback that can go away and come back with its database."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.port = folder, free_port()
+        self.uri = f"http://127.0.0.1:{self.port}"
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        command = [
+            sys.executable, "-m", "mlflow", "server", "--backend-store-uri", f"sqlite:///{self.folder}/server.db",
+            "--artifacts-destination", str(self.folder / "artifacts"), "--host", "127.0.0.1", "--port", str(self.port),
+            "--workers", "1",
+        ]  # fmt: skip
+        with (self.folder / "server.log").open("a") as log:
+            environment = os.environ | {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}  # of eight processes more
+            self._process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True, env=environment)
+        wait_for(lambda: answers(f"{self.uri}/health"), "mlflow server")
+
+    def stop(self) -> None:
+        if self._process is not None:
+            self._process.send_signal(signal.SIGTERM)
+            self._process.wait(30)
+            self._process = None
+            wait_for(lambda: not answers(f"{self.uri}/health"), "the end of mlflow server")
+
+
+@pytest.fixture(scope="session")
+def mlflow_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """One MLflow server for the whole session."""
+    server = Server(tmp_path_factory.mktemp("server"))
+    server.start()
+    yield server
+    server.stop()
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    if CHROMIUM is None:
+        pytest.fail("no chromium here; wanted it for the tests of pages: apt-get install chromium")
+    with sync_playwright() as playwright:
+        # Its sandbox does not work for root, and the pages are our own.
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
 
 
 class Programs:

@@ -1,13 +1,13 @@
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 
 from dmil_core.configs import preset_of
 from services import meta_train
@@ -20,7 +20,6 @@ from services.runners import LocalRunner
 from services.settings_files import merged
 from services.tracking import Tracker
 
-CHROMIUM = shutil.which("chromium")
 EXAMPLE = Path(__file__).parents[3] / "docs" / "examples" / "planar_visits" / "planar_visits.py"
 
 
@@ -61,17 +60,6 @@ class Opened:
             )
             found.append((told, box["width"] if box else 0.0, box["height"] if box else 0.0))
         return found
-
-
-@pytest.fixture(scope="session")
-def browser() -> Iterator[Browser]:
-    if CHROMIUM is None:
-        pytest.fail("no chromium here; wanted it for the tests of pages: apt-get install chromium")
-    with sync_playwright() as playwright:
-        # Its sandbox does not work for root, and the pages are our own.
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

@@ -79,7 +79,11 @@ def sweep(programs, workplace: Path, mlflow_file: str, joined) -> Callable[[str]
         tables = json.loads((folder / "tables" / "tables.json").read_text())
         assert set(tables["trials"]) <= {"finished", "stopped"}, printed
         assert tables["what"] in printed
-        return tables, *runs_of(mlflow_file, folder)
+        parent, children = runs_of(mlflow_file, folder)
+        (link,) = [line for line in printed.splitlines() if line.startswith("its trials side by side: ")]
+        assert link.startswith("its trials side by side: http://127.0.0.1:5000/#/compare-runs?runs=")
+        assert all(child.info.run_id in link for child in children)
+        return tables, parent, children
 
     return run
 

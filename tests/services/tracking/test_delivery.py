@@ -67,7 +67,8 @@ def test_what_mlflow_took_before_a_kill_kept_us_from_noting_it_is_there_once(tmp
 def delivered_two(identity: Identity) -> dict[str, object]:
     """Return what the begin and the parameters change in an identity."""
     assert identity.run_id is not None
-    return {"run_id": identity.run_id, "delivered": 2}
+    assert identity.experiment_id is not None
+    return {"run_id": identity.run_id, "experiment_id": identity.experiment_id, "delivered": 2}
 
 
 @pytest.mark.usefixtures("no_mlflow")

@@ -10,6 +10,7 @@ from services.checkpoints import Checkpoint
 from services.tracking import Tracker
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.delivery import BusyError, Delivery, Identity
+from services.tracking.models import models_of
 from services.tracking.spool import read_spool
 from tests.services.tracking.conftest import records, steps
 
@@ -30,7 +31,7 @@ def test_with_no_server_training_ends_and_a_flush_delivers(
     done = [measured.step for measured in records(folder, "metrics") if "gradient_norm" in measured.values]
     assert done == [1, 2, 3]
     assert {line.kind for line in read_spool(folder / "tracking.jsonl")} == {
-        "begin", "parameters", "tags", "inputs", "metrics", "artifact", "end",
+        "begin", "parameters", "tags", "inputs", "metrics", "system", "artifact", "model", "end",
     }  # fmt: skip
     assert (folder / "summary.json").exists()
 
@@ -51,6 +52,8 @@ def test_with_no_server_training_ends_and_a_flush_delivers(
     run = MlflowClient(mlflow_file).get_run(str(run_id))
     (began, ended) = (records(folder, "metrics")[0].time, records(folder, "end")[0].time)
     assert (run.info.status, run.info.end_time) == ("FINISHED", ended)
+    (model,) = models_of(MlflowClient(mlflow_file), run)
+    assert model.tags["checkpoint"] == checkpoint.digest
     assert began - 60_000 < run.info.start_time < ended
 
 
@@ -73,3 +76,9 @@ def test_what_holds_no_run_is_refused(tmp_path: Path, complaint):
     assert f"RUN: got '{tmp_path}'; wanted a folder with a tracking.jsonl in it" in complaint(
         tracking_program, "flush", str(tmp_path)
     )
+
+
+def test_a_report_is_delivered_again_where_there_is_one_only(complaint, tmp_path: Path):
+    (tmp_path / "tracking.jsonl").write_text("")
+    told = complaint(tracking_program, "report", str(tmp_path))
+    assert f"RUN: got {tmp_path}, which has no folder report; wanted a finished run" in told

@@ -1,11 +1,9 @@
 """Tracking never stops training: what MLflow does not take waits, and is delivered later."""
 
 import signal
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -18,6 +16,7 @@ from services.disk import DiskFullError
 from services.tracking import Tracker, redacted
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.delivery import Identity
+from tests.services.conftest import Server
 from tests.services.tracking.conftest import records, steps
 
 
@@ -171,36 +170,9 @@ def test_a_killed_run_that_goes_on_has_every_iteration_once(
     assert MlflowClient(mlflow_file).get_run(str(run_id)).info.status == "FINISHED"
 
 
-class Server:
-    """A real MLflow server on loopback that can go away and come back with its database."""
-
-    def __init__(self, folder: Path, port: int, answers: Callable, wait_for: Callable) -> None:
-        self.folder, self.port, self.uri = folder, port, f"http://127.0.0.1:{port}"
-        self._answers, self._wait_for = answers, wait_for
-        self._process: subprocess.Popen | None = None
-
-    def start(self) -> None:
-        command = [
-            sys.executable, "-m", "mlflow", "server", "--backend-store-uri", f"sqlite:///{self.folder}/server.db",
-            "--artifacts-destination", str(self.folder / "artifacts"), "--host", "127.0.0.1", "--port", str(self.port),
-            "--workers", "1",
-        ]  # fmt: skip
-        with (self.folder / "server.log").open("a") as log:
-            self._process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
-        self._wait_for(lambda: self._answers(f"{self.uri}/health"), "mlflow server")
-
-    def stop(self) -> None:
-        if self._process is not None:
-            self._process.send_signal(signal.SIGTERM)
-            self._process.wait(30)
-            self._process = None
-            self._wait_for(lambda: not self._answers(f"{self.uri}/health"), "the end of mlflow server")
-
-
 @pytest.fixture
-def server(tmp_path: Path, free_port, answers, wait_for, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
-    monkeypatch.setenv("MLFLOW_SERVER_ENABLE_JOB_EXECUTION", "false")
-    server = Server(tmp_path, free_port(), answers, wait_for)
+def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+    server = Server(tmp_path)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", server.uri)
     monkeypatch.setattr(tracking, "RETRY_SECONDS", 0.5)
     yield server

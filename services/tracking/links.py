@@ -1,0 +1,37 @@
+"""Addresses of MLflow's pages: of a run, and of runs side by side."""
+
+import json
+from collections.abc import Sequence
+from urllib.parse import quote, urlsplit, urlunsplit
+
+__all__ = ["comparison_link", "how_to_look", "run_link"]
+
+LOCAL = "http://127.0.0.1:5000"
+"""Where ``mlflow ui`` serves what is no server itself."""
+
+TRAINING = "workflowType=machine_learning"
+"""What has MLflow show its pages for training beside, not those for applications of language models."""
+
+
+def run_link(uri: str, experiment_id: str, run_id: str) -> str:
+    """Return the address of a run's page, for an MLflow at `uri`."""
+    return f"{_site(uri)}/#/experiments/{experiment_id}/runs/{run_id}?{TRAINING}"
+
+
+def comparison_link(uri: str, experiment_id: str, run_ids: Sequence[str]) -> str:
+    """Return the address of the page that has runs of one experiment side by side."""
+    runs, experiments = (quote(json.dumps(ids, separators=(",", ":"))) for ids in (list(run_ids), [experiment_id]))
+    return f"{_site(uri)}/#/compare-runs?runs={runs}&experiments={experiments}&{TRAINING}"
+
+
+def how_to_look(uri: str) -> str | None:
+    """Return the command that serves the pages of an MLflow that is a file, or None of one that serves them itself."""
+    return f"mlflow ui --backend-store-uri {uri} --host 127.0.0.1" if uri.startswith("sqlite") else None
+
+
+def _site(uri: str) -> str:
+    """Return where the pages are, without a user and a password."""
+    if not uri.startswith("http"):
+        return LOCAL
+    parts = urlsplit(uri)
+    return urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2], path=parts.path.rstrip("/"), query=""))

@@ -1,0 +1,116 @@
+"""A run's model in MLflow: its last checkpoint, with the code that turns a support set into actions."""
+
+import tempfile
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dmil_core.configs import EvaluationConfig
+from services.checkpoints import Checkpoint
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+    from mlflow.entities import LoggedModel, Run
+    from mlflow.models import ModelSignature
+
+__all__ = ["CHECKPOINT_TAG", "checkpoint_in", "log_model", "models_of"]
+
+NAME = "model"
+CODE = Path(__file__).with_name("imitator.py")
+CHECKPOINT_TAG = "checkpoint"
+"""The digest of what the model was made of."""
+LIBRARIES = ("mlflow", "numpy", "torch")
+"""That a model asks for by their version. Not the project itself: an index may hold somebody else's under its name."""
+
+
+def models_of(client: "MlflowClient", run: "Run") -> "list[LoggedModel]":
+    """Return the models of a run that are there as a whole, the newest first."""
+    found = client.search_logged_models([run.info.experiment_id], f"source_run_id = '{run.info.run_id}'")
+    return [model for model in found if model.status == "READY"]
+
+
+def checkpoint_in(model: Path) -> Path:
+    """Return the folder of the checkpoint in a model that was downloaded."""
+    from mlflow.models import Model
+
+    return model / Model.load(str(model)).flavors["python_function"]["artifacts"]["checkpoint"]["path"]
+
+
+def log_model(client: "MlflowClient", run_id: str, checkpoint: Checkpoint, example: dict[str, Any]) -> None:
+    """Have MLflow keep a checkpoint as the model of a run; one that it has already stays as it is.
+
+    Args:
+        client: of MLflow.
+        run_id: of the run.
+        checkpoint: of the run.
+        example: of what the model is asked.
+    """
+    run = client.get_run(run_id)
+    if any(model.tags.get(CHECKPOINT_TAG) == checkpoint.digest for model in models_of(client, run)):
+        return
+    config = checkpoint.manifest.config
+    tags = {"suite": config.suite.name, "method": config.method.name, "seed": str(config.seed)}
+    model = client.create_logged_model(
+        run.info.experiment_id, NAME, run_id, {**tags, CHECKPOINT_TAG: checkpoint.digest}, model_type=config.method.name
+    )
+    with tempfile.TemporaryDirectory() as made:
+        _save(Path(made) / NAME, checkpoint, example, model)
+        client.log_model_artifacts(model.model_id, str(Path(made) / NAME))
+    from mlflow.entities import LoggedModelOutput
+
+    client.log_outputs(run_id, [LoggedModelOutput(model.model_id, checkpoint.manifest.iteration)])
+    client.finalize_logged_model(model.model_id, "READY")
+
+
+def _save(folder: Path, checkpoint: Checkpoint, example: dict[str, Any], model: "LoggedModel") -> None:
+    """Write a model as MLflow has it, without a pickle."""
+    from mlflow.models import Model
+    from mlflow.pyfunc import save_model
+
+    save_model(
+        folder,
+        python_model=CODE,
+        artifacts={"checkpoint": str(checkpoint.path)},
+        signature=_signature(checkpoint.manifest.config.evaluation),
+        input_example=example,
+        pip_requirements=[f"{library}=={version(library)}" for library in LIBRARIES],
+        model_config={"action_dim": len(example["support"][0]["actions"][0])},
+        mlflow_model=Model(
+            artifact_path=model.artifact_location,
+            model_uuid=model.model_id,
+            model_id=model.model_id,
+            run_id=model.source_run_id,
+            metadata={"needs": "this project, installed where the model is loaded", **checkpoint.manifest.versions},
+        ),
+    )
+
+
+def _signature(evaluation: EvaluationConfig) -> "ModelSignature":
+    from mlflow.models import ModelSignature
+    from mlflow.types import ParamSchema, ParamSpec
+    from mlflow.types.schema import Array, ColSpec, DataType, Object, Property, Schema
+
+    rows = Array(Array(DataType.double))
+    demonstration = Object([Property("observations", rows), Property("actions", rows)])
+    return ModelSignature(
+        inputs=Schema(
+            [
+                ColSpec(Array(demonstration), "support"),
+                ColSpec(Array(DataType.double), "observation"),
+                ColSpec(Array(DataType.long), "memory", required=False),
+            ]
+        ),
+        outputs=Schema(
+            [
+                ColSpec(Array(DataType.double), "action"),
+                ColSpec(DataType.long, "sub_skill"),
+                ColSpec(Array(DataType.long), "memory"),
+            ]
+        ),
+        params=ParamSchema(
+            [
+                ParamSpec("fine_tuning_steps", DataType.long, evaluation.fine_tuning_steps),
+                ParamSpec("learning_rate", DataType.double, evaluation.learning_rate),
+            ]
+        ),
+    )

@@ -1,0 +1,29 @@
+from urllib.parse import parse_qs, urlsplit
+
+import pytest
+
+from services.tracking.links import comparison_link, how_to_look, run_link
+
+
+@pytest.mark.parametrize(
+    ("uri", "site"),
+    [
+        ("http://127.0.0.1:5000", "http://127.0.0.1:5000"),
+        ("https://user:SECRET@host/mlflow/?x=SECRET", "https://host/mlflow"),
+        ("sqlite:///mlflow.db", "http://127.0.0.1:5000"),
+        ("postgresql://user:SECRET@host/db", "http://127.0.0.1:5000"),
+    ],
+)
+def test_links_lead_to_the_pages_of_the_server_or_of_mlflow_ui_without_secrets(uri: str, site: str):
+    assert run_link(uri, "3", "abc").startswith(f"{site}/#/experiments/3/runs/abc?")
+    comparison = urlsplit(comparison_link(uri, "3", ["abc", "def"]))
+    asked = urlsplit(comparison.fragment)
+    assert asked.path == "/compare-runs"
+    assert parse_qs(asked.query)["runs"] == ['["abc","def"]']
+    assert parse_qs(asked.query)["experiments"] == ['["3"]']
+    assert "SECRET" not in comparison.geturl()
+
+
+def test_a_file_is_looked_at_with_mlflow_ui():
+    assert how_to_look("sqlite:///a.db") == "mlflow ui --backend-store-uri sqlite:///a.db --host 127.0.0.1"
+    assert how_to_look("http://127.0.0.1:5000") is None
