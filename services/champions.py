@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mlflow.entities import LoggedModel
     from mlflow.entities.model_registry import ModelVersion
 
-__all__ = ["ALIAS", "Contest", "PromotionError", "RegistryError", "open_contest"]
+__all__ = ["ALIAS", "Contest", "PromotionError", "RegistryError", "is_better", "open_contest"]
 
 ALIAS = "champion"
 
@@ -70,7 +70,7 @@ def open_contest(checkpoint: Checkpoint, experiment: Experiment, folder: Path) -
     uri, name = tracking_uri(), experiment.suite.name
     with _asking(uri):
         client = MlflowClient(uri)
-        challenger = _model_of(client, checkpoint, uri)
+        challenger = _model_of(client, checkpoint)
         found = client.search_registered_models(f"name = '{name}'")
         has_one = bool(found) and ALIAS in found[0].aliases
         champion = client.get_model_version_by_alias(name, ALIAS) if has_one else None
@@ -86,7 +86,7 @@ def open_contest(checkpoint: Checkpoint, experiment: Experiment, folder: Path) -
     return Contest(client, uri, experiment, challenger, champion, rival, folder)
 
 
-def _model_of(client: "MlflowClient", checkpoint: Checkpoint, uri: str) -> "LoggedModel":
+def _model_of(client: "MlflowClient", checkpoint: Checkpoint) -> "LoggedModel":
     run_id, home = checkpoint.manifest.mlflow_run_id, checkpoint.path.absolute().parents[1]
     if run_id is None and (home / IDENTITY).exists():  # MLflow was away when the checkpoint was written
         run_id = Identity.of(home).run_id
