@@ -167,7 +167,7 @@ def draw_episodes(seen: Sequence[Seen], measure: Measure, best_score: int) -> Pi
                 axis.plot(steps, course, label=label, markevery=[-1], linewidth=1.2, **style, **drawing)
         axis.set(xlabel="step", ylabel=measure.words, xlim=(0, None))
         if scored:
-            axis.set(ylim=(-0.1, best_score * 1.1))
+            axis.set(ylim=(-0.1, best_score * 1.1), yticks=range(best_score + 1))
         else:
             axis.set_ylim(bottom=0)
         axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
@@ -175,7 +175,8 @@ def draw_episodes(seen: Sequence[Seen], measure: Measure, best_score: int) -> Pi
         told = " ".join(
             _in_words(word, kinds[success], measure) for success, word in ((False, "failed"), (True, "solved"))
         )
-        return drawn(figure, title, f"A line is an episode; a cross or a dot is its end. {told}")
+        apart = "; equal scores are drawn a little apart" if scored else ""
+        return drawn(figure, title, f"A line is an episode; a cross or a dot is its end{apart}. {told}")
 
 
 def _in_words(word: str, seen: Sequence[Seen], measure: Measure) -> str:

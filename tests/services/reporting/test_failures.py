@@ -116,9 +116,11 @@ def test_equal_scores_are_drawn_apart(finished: FinishedRun):
     course = np.repeat([0.0, 1.0, 2.0], 10)
     measure = Measure("score", "sub-tasks done")
     picture = draw_episodes(seen_with([course, course], [False, False], finished.episodes[0], "score"), measure, 4)
+    assert "equal scores are drawn a little apart" in picture.description
     assert "None solved." in picture.description
-    lines = re.findall(rf'<path d="([^"]*)"[^>]*stroke: {FAILED["color"]}[^>]*stroke-opacity', picture.svg)
-    assert len(set(lines)) >= 2
+    assert all(f">{score}<" in picture.svg for score in range(5)), "the scores that there may be"
+    lines = re.findall(rf'<path d="([^"]*)"[^>]*fill: none; stroke: {FAILED["color"]}; stroke-width', picture.svg)
+    assert len(set(lines)) == len(lines) == 3, "both, and the legend's"
 
 
 def test_a_policy_that_diverged_at_once_has_no_line_but_a_row(with_rows):
