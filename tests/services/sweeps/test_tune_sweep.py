@@ -184,6 +184,7 @@ def test_a_killed_sweep_goes_on_where_it_was(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("joined")
+@pytest.mark.usefixtures("joined")
 def test_what_a_sweep_trained_is_fetched_elsewhere(programs, workplace: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv(STORAGE, (tmp_path / "storage").as_uri())
     file = write_sweep({"DMIL": {}}, settings={"training": {"iterations": 4, "checkpoint_every": 2}})
