@@ -3,7 +3,7 @@
 import json
 import shutil
 import signal
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -22,32 +22,6 @@ from services.storage import STORAGE
 from services.sweeps.folders import SweepFolder
 from services.tracking import Tracker
 
-ROWS = {
-    "bilevel": ["DMIL", "DMIL-High", "DMIL-Low", "OptionGAIL"],
-    "continuity": ["DMIL_nc", "λ = 0.01", "DMIL", "λ = 1"],
-    "em": ["DMIL", "DMIL_soft"],
-    "finetune_steps": ["10", "30", "50", "100", "300", "500"],
-    "kitchen_k": ["K=2", "K=4", "K=8"],
-    "methods": [
-        "DMIL",
-        "OptionGAIL",
-        "OptionGAIL offline",
-        "MIL",
-        "MLSH",
-        "PEMIRL",
-        "behaviour cloning",
-        "per task",
-        "nearest neighbour",
-    ],
-    "negatives": ["same", "mismatched"],
-    "sub_skills": ["K=2", "K=3", "K=5", "K=8", "K=10"],
-}
-WITHOUT_PAPER = ("continuity", "methods", "negatives", "sub_skills")
-"""Sweeps with rows, or all of them, that the paper does not have."""
-
-FLAT = {"MIL", "PEMIRL", "same", "mismatched", "behaviour cloning", "per task", "nearest neighbour"}
-"""Rows of methods without sub-skills."""
-
 
 def write_sweep(variants: dict[str, object], **changes: object) -> str:
     """Write a small sweep in the working directory."""
@@ -59,83 +33,13 @@ def write_sweep(variants: dict[str, object], **changes: object) -> str:
     return "small.yaml"
 
 
-def runs_of(uri: str, sweep: Path) -> tuple[Run, list[Run]]:
-    """Return the sweep's MLflow run and its children."""
-    client = MlflowClient(uri)
-    parent_id = json.loads((sweep / "mlflow_run.json").read_text())["run_id"]
-    parent = client.get_run(parent_id)
-    found = client.search_runs([parent.info.experiment_id], f"tags.`mlflow.parentRunId` = '{parent_id}'")
-    return parent, list(found)
-
-
-@pytest.fixture
-def sweep(programs, workplace: Path, mlflow_file: str, joined) -> Callable[[str], tuple[dict, Run, list[Run]]]:
-    """Run one of the project's sweeps at scale smoke; return its tables and its MLflow runs."""
-
-    def run(name: str) -> tuple[dict, Run, list[Run]]:
-        code, printed = programs("tune_sweep", name, "--scale", "smoke", "--name", name)
-        assert code == 0, printed
-        folder = workplace / "runs" / name
-        tables = json.loads((folder / "tables" / "tables.json").read_text())
-        assert set(tables["trials"]) <= {"finished", "stopped"}, printed
-        assert tables["what"] in printed
-        parent, children = runs_of(mlflow_file, folder)
-        (link,) = [line for line in printed.splitlines() if line.startswith("its trials side by side: ")]
-        assert link.startswith("its trials side by side: http://127.0.0.1:5000/#/compare-runs?runs=")
-        assert all(child.info.run_id in link for child in children)
-        return tables, parent, children
-
-    return run
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ROWS)
-def test_each_sweep_ends_with_its_table(sweep, mlflow_file: str, name: str) -> None:
-    tables, parent, children = sweep(name)
-    artifacts = [found.path for found in MlflowClient(mlflow_file).list_artifacts(parent.info.run_id, "tables")]
-    assert {"tables/report.html", "tables/table.png"} <= set(artifacts)
-    assert list(dict.fromkeys(cell["row"] for cell in tables["cells"])) == ROWS[name]
-    assert all(cell["episodes"] and cell["seeds"] == [0] for cell in tables["cells"])
-    papers = [cell["paper"] for cell in tables["cells"]]
-    assert all(papers) if name not in WITHOUT_PAPER else name == "continuity" or not any(papers)
-    assert parent.info.status == "FINISHED"
-    assert tables["what"] in parent.data.tags["mlflow.note.content"]
-    assert len(children) == sum(tables["trials"].values())
-    for child in children:
-        assert child.info.status == "FINISHED"
-        assert child.data.tags["sweep"] == name
-        assert {"suite", "method", "seed", "variant"} <= child.data.tags.keys()
-        assert any("success_rate/" in metric for metric in child.data.metrics)
-        if child.data.tags["method"] not in ("per-task", "nearest-neighbour"):
-            assert "loss" in child.data.metrics
-    practised = {cell["row"] for cell in tables["cells"] if cell["environment_steps"]}
-    assert practised == {"OptionGAIL"} & set(ROWS[name])
-    flat = {cell["row"] for cell in tables["cells"] if cell["sub_skills_in_use"] is None}
-    assert flat == FLAT & set(ROWS[name])
-
-
-@pytest.mark.slow
-def test_a_search_stops_the_worse_and_names_the_best(sweep, workplace: Path) -> None:
-    tables, _, children = sweep("search")
-    assert len(tables["samples"]) == len(children) == 4
-    assert tables["samples"][0]["status"] == "finished"
-    assert {child.info.status for child in children} == {"FINISHED"}
-    assert all(sample["held_out"] is not None for sample in tables["samples"])
-    assert set(yaml.safe_load((workplace / "runs/search/tables/best.yaml").read_text())) == {"method", "training"}
-    assert {cell["split"] for cell in tables["cells"]} <= {"meta-training", "meta-testing"}
-    folder = SweepFolder(workplace / "runs" / "search")
-    rows = "".join(path.read_text() for path in folder.runs.glob("trained/*/evaluated/*/episodes.jsonl"))
-    tasks = {json.loads(line)["task"] for line in rows.splitlines()}
-    assert tasks == {"reach", "drawer-close", "push"}
-
-
 def steps_of(uri: str, run: Run, metric: str) -> list[int]:
     return sorted(point.step for point in MlflowClient(uri).get_metric_history(run.info.run_id, metric))
 
 
 @pytest.mark.slow
 def test_a_killed_sweep_goes_on_where_it_was(
-    programs, workplace: Path, mlflow_file: str, wait_for, data: dict[str, TaskDemonstrations]
+    programs, workplace: Path, mlflow_file: str, runs_of, wait_for, data: dict[str, TaskDemonstrations]
 ) -> None:
     """Finished trials stay, those under way go on from their checkpoints to the same bits, MLflow holds each once."""
     file = write_sweep({name: {"method": {"sub_skills": k}} for k, name in enumerate("abc", 1)})
@@ -232,7 +136,7 @@ def named(processes: Iterable[psutil.Process], name: str) -> list[psutil.Process
 
 @pytest.mark.slow
 def test_a_trial_that_fails_or_dies_leaves_the_others_alone(
-    programs, workplace: Path, mlflow_file: str, wait_for
+    programs, workplace: Path, mlflow_file: str, runs_of, wait_for
 ) -> None:
     """One has an error, which is told; one loses its process, and is begun again; trials of two CPUs each."""
     variants = {"good": {}, "spoilt": {"training": {"learning_rate": 1e30}}}
@@ -293,12 +197,3 @@ def test_a_mistake_in_a_file_is_told_with_its_place(complaint) -> None:
     assert "small.yaml" in complaint(tune_sweep.run, file)
     file = write_sweep({})
     assert f"{file}: " in complaint(tune_sweep.run, file)
-
-
-def test_help_lists_the_sweeps(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        tune_sweep.run(["--help"])
-    printed = capsys.readouterr().out
-    for name in (*ROWS, "search"):
-        assert f"  {name} " in printed
-    assert "(Table 4)" in printed
