@@ -22,8 +22,8 @@ import numpy as np
 from rich.box import SIMPLE
 from rich.table import Table
 
-from benchmarks.scaling import made_up_plan
 from benchmarks.timing import alternate, write_rows
+from benchmarks.workload import made_up_plan
 from services.command_line import exit_code, parse
 from services.progress import console
 from services.runners import Iteration, LocalMetaTraining
@@ -105,7 +105,7 @@ class Run:
         self.name, self.folder = name, folder
         self.cpu_seconds: list[float] = []
         self.call_seconds: list[float] = []
-        self._training = LocalMetaTraining(made_up_plan("quick"))
+        self._training = LocalMetaTraining(made_up_plan("ml10-quick"))
         self.tracker: Tracker | None = None
         if uri is not None:
             folder.mkdir()
