@@ -98,7 +98,7 @@ def test_tracking(tmp_path: Path) -> None:
 @pytest.mark.alone
 @pytest.mark.timeout(1800)
 def test_faults(tmp_path: Path) -> None:
-    found = rows_of("faults", "--kills", "8", "--seed", "1", "--folder", str(tmp_path / "campaign"), folder=tmp_path)
-    assert (found["kills"], found["equal"], found["lost"], found["different"]) == (8, 8, 0, 0)
+    found = rows_of("faults", "--kills", "5", "--seed", "1", "--folder", str(tmp_path / "campaign"), folder=tmp_path)
+    assert (found["kills"], found["equal"], found["lost"], found["different"]) == (5, 5, 0, 0)
     assert found["seconds"] > 0
     assert set(found["cost"]) == {"worker", "all workers", "learner", "driver"}
