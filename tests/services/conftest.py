@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from mlflow import MlflowClient
 from playwright.sync_api import Browser, sync_playwright
 
 from dmil_core.configs import PRESETS, ExperimentConfig
@@ -145,8 +146,10 @@ def joined(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> Cluster:
 
 @pytest.fixture(scope="session")
 def mlflow_file(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The address of an SQLite file, whose tables are made once."""
-    return f"sqlite:///{tmp_path_factory.mktemp('mlflow') / 'mlflow.db'}"
+    """The address of an SQLite file with its tables: who is killed while it makes them leaves a file of no use."""
+    uri = f"sqlite:///{tmp_path_factory.mktemp('mlflow') / 'mlflow.db'}"
+    MlflowClient(uri).search_experiments()
+    return uri
 
 
 @pytest.fixture
