@@ -25,8 +25,8 @@ from dmil_core.methods.base import FineTuning
 from dmil_core.methods.dmil import DmilPolicy
 from dmil_core.methods.mil import Mil, MilConfig
 from dmil_core.seeding import stream
-from services.command_line import exit_code, parse
-from services.progress import console
+from services.cli.arguments import exit_code, parse
+from services.cli.progress import console
 
 __all__ = ["Arguments", "run"]
 

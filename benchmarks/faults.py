@@ -27,9 +27,9 @@ from rich.box import SIMPLE
 from rich.table import Table
 from scipy.optimize import nnls
 
-from services.command_line import exit_code, parse
-from services.disk import write_file
-from services.progress import Bar, console
+from services.cli.arguments import exit_code, parse
+from services.cli.progress import Bar, console
+from services.storage.files import write_file
 
 __all__ = ["Arguments", "run"]
 

@@ -27,8 +27,8 @@ from benchmarks.timing import alternate, write_rows
 from benchmarks.workload import OBS_DIM, Size, as_in_a_run, draw_parameters, draw_sets, settings
 from dmil_core.dmil_config import DmilConfig
 from dmil_core.meta_gradient import task_gradient
-from services.command_line import exit_code, parse
-from services.progress import Bar, console
+from services.cli.arguments import exit_code, parse
+from services.cli.progress import Bar, console
 
 __all__ = ["Arguments", "run"]
 

@@ -4,9 +4,9 @@ Demonstrations are made up, in the shape of Meta-World's: 39-dimensional observa
 100 steps, five slots a group. The local runner, one worker and two take turns, and medians over all iterations are
 given.
 
-The seconds of an iteration are divided up whole, see `services.timing.Timing`. The overhead's share is what is left of
-the iteration beside an ideal one: 1 - (worker compute seconds / workers + step seconds) / iteration seconds. So waiting
-for the slower worker counts as overhead too.
+The seconds of an iteration are divided up whole, see `services.distributed.timing.Timing`. The overhead's share is what is
+left of the iteration beside an ideal one: 1 - (worker compute seconds / workers + step seconds) / iteration seconds. So
+waiting for the slower worker counts as overhead too.
 """
 
 import os
@@ -24,13 +24,13 @@ from benchmarks.cluster_model import calls_of_a_tree
 from benchmarks.timing import alternate, write_rows
 from benchmarks.workload import Size, made_up_plan
 from dmil_core.configs import PRESETS
-from services.command_line import exit_code, parse
-from services.progress import console
-from services.ray_meta_training import FAN_IN, RayMetaTraining
-from services.ray_runner import RayRunner
-from services.runners import LocalMetaTraining, MetaTraining
+from services.cli.arguments import exit_code, parse
+from services.cli.progress import console
+from services.distributed.ray_meta_training import FAN_IN, RayMetaTraining
+from services.distributed.ray_runner import RayRunner
+from services.distributed.runner import LocalMetaTraining, MetaTraining
+from services.distributed.timing import Timing
 from services.suites.metaworld import MetaWorldSuite
-from services.timing import Timing
 
 __all__ = ["Arguments", "run"]
 

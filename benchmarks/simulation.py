@@ -36,10 +36,10 @@ from dmil_core.methods.base import FineTuning, Policy
 from dmil_core.methods.dmil import Dmil
 from dmil_core.networks import Parameters, flatten
 from dmil_core.seeding import stream
-from services.actors.simulation import SimulationWorker
-from services.command_line import exit_code, parse
-from services.progress import console
-from services.rollouts import TrialOutcome, demonstrate, trials
+from services.cli.arguments import exit_code, parse
+from services.cli.progress import console
+from services.distributed.simulation_worker import SimulationWorker
+from services.rollouts.trials import TrialOutcome, demonstrate, trials
 from services.suites.metaworld import SPLITS, MetaWorldSuite, SeededEpisodes
 
 __all__ = ["Arguments", "run"]

@@ -24,13 +24,13 @@ from benchmarks.workload import made_up_plan
 from dmil_core.configs import PRESETS
 from dmil_core.networks import unflatten
 from dmil_core.outer_loop import add, group_gradient
-from services.actors.freight import pack
-from services.actors.learner import Learner
-from services.command_line import exit_code, parse
-from services.progress import console
-from services.ray_meta_training import FAN_IN, RayMetaTraining
-from services.ray_runner import RayRunner
-from services.runners import Plan
+from services.cli.arguments import exit_code, parse
+from services.cli.progress import console
+from services.distributed.chunking import pack
+from services.distributed.learner import Learner
+from services.distributed.ray_meta_training import FAN_IN, RayMetaTraining
+from services.distributed.ray_runner import RayRunner
+from services.distributed.runner import Plan
 from services.suites.metaworld import MetaWorldSuite
 
 __all__ = ["Arguments", "run"]

@@ -24,9 +24,9 @@ from rich.table import Table
 
 from benchmarks.timing import alternate, write_rows
 from benchmarks.workload import made_up_plan
-from services.command_line import exit_code, parse
-from services.progress import console
-from services.runners import Iteration, LocalMetaTraining
+from services.cli.arguments import exit_code, parse
+from services.cli.progress import console
+from services.distributed.runner import Iteration, LocalMetaTraining
 from services.tracking import Tracker
 from services.tracking.delivery import Identity
 from services.tracking.spool import read_spool

@@ -14,7 +14,7 @@ from dmil_core.methods.dmil import Dmil
 from dmil_core.networks import Parameters, flatten, initialise, unflatten
 from dmil_core.outer_loop import OuterState
 from dmil_core.seeding import stream
-from services.runners import Plan
+from services.distributed.runner import Plan
 from services.suites.metaworld import MetaWorldSuite
 
 __all__ = [

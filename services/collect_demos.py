@@ -17,10 +17,10 @@ from rich.table import Table
 
 from dmil_core.configs import ExperimentConfig
 from services import inspect_demos, record_demos, verify_experts
-from services.command_line import DEFAULT_PRESET, Quiet, defaults_from, exit_code, parse
-from services.demo_store import TaskDemonstrations, open_store
-from services.experiment import Experiment, RunnerKind, open_runner
-from services.progress import Clock, console
+from services.cli.arguments import DEFAULT_PRESET, Quiet, defaults_from, exit_code, parse
+from services.cli.progress import Clock, console
+from services.demonstrations.store import TaskDemonstrations, open_store
+from services.experiments.experiment import Experiment, RunnerKind, open_runner
 
 __all__ = ["Arguments", "run"]
 

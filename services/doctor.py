@@ -15,12 +15,12 @@ from uuid import uuid4
 from rich.table import Table
 
 from dmil_core.errors import RunError
-from services.cluster import joined
-from services.command_line import exit_code, parse
-from services.demo_store import data_root
-from services.disk import DiskFullError, write_file
-from services.node_facts import NodeFacts, cluster_facts, facts
-from services.progress import console
+from services.cli.arguments import exit_code, parse
+from services.cli.progress import console
+from services.demonstrations.store import data_root
+from services.distributed.cluster import joined
+from services.distributed.node_info import NodeFacts, cluster_facts, facts
+from services.storage.files import DiskFullError, write_file
 from services.tracking import in_words, redacted, tracking_uri
 
 __all__ = ["Arguments", "Finding", "examine", "run"]

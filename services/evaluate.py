@@ -11,14 +11,14 @@ from pathlib import Path
 import tyro
 
 from dmil_core.configs import EvaluationConfig
-from services.champions import ALIAS, open_contest
-from services.checkpoints import Checkpoint, Checkpoints
-from services.command_line import ConfigError, Quiet, exit_code, parse, peek, with_evaluation
-from services.demo_store import open_store
-from services.experiment import Experiment, RunnerKind, open_runner
-from services.progress import Clock, console
+from services.cli.arguments import ConfigError, Quiet, exit_code, parse, peek, with_evaluation
+from services.cli.progress import Clock, console
+from services.demonstrations.store import open_store
+from services.evaluation.summary import summarise
+from services.experiments.champions import ALIAS, open_contest
+from services.experiments.experiment import Experiment, RunnerKind, open_runner
 from services.report import show, write_report
-from services.summary import summarise
+from services.storage.checkpoints import Checkpoint, Checkpoints
 
 __all__ = ["Arguments", "run"]
 

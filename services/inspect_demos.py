@@ -11,9 +11,9 @@ import tyro
 from rich.table import Table
 
 from dmil_core.demonstrations import Demonstration, DemonstrationError
-from services.command_line import exit_code, parse, suite_settings
-from services.progress import Bar, console
-from services.recordings import FORMS, Recording, misfits, read_recordings
+from services.cli.arguments import exit_code, parse, suite_settings
+from services.cli.progress import Bar, console
+from services.demonstrations.external import FORMS, Recording, misfits, read_recordings
 from services.suites.base import TaskSuite
 from services.suites.registry import open_suite
 

@@ -23,9 +23,9 @@ import tyro
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dmil_core.errors import RunError, UserError, explain
-from services.command_line import exit_code, parse
-from services.disk import read_file, write_file
-from services.progress import console
+from services.cli.arguments import exit_code, parse
+from services.cli.progress import console
+from services.storage.files import read_file, write_file
 
 __all__ = ["Arguments", "ClusterError", "Record", "StartError", "run"]
 

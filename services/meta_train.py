@@ -17,18 +17,18 @@ from pydantic import ValidationError
 
 from dmil_core.configs import DEFAULT_METHOD, ExperimentConfig
 from dmil_core.errors import explain
-from services.checkpoints import Checkpoint, Checkpoints
-from services.command_line import DEFAULT_PRESET, ConfigError, Quiet, defaults_from, exit_code, parse, peek
-from services.demo_store import open_store
-from services.disk import read_file, write_file
-from services.experiment import Experiment, OnNonfinite, RunnerKind, open_runner
-from services.folders import find_folder, new_folder
-from services.progress import Clock, console
-from services.replica import replicated, restored
+from services.cli.arguments import DEFAULT_PRESET, ConfigError, Quiet, defaults_from, exit_code, parse, peek
+from services.cli.progress import Clock, console
+from services.demonstrations.store import open_store
+from services.evaluation.summary import summarise
+from services.experiments.experiment import Experiment, OnNonfinite, RunnerKind, open_runner
+from services.experiments.finished_run import FinishedRun
 from services.report import PAGE, publish, show, write_report
-from services.reporting.finished import FinishedRun
-from services.storage import STORAGE
-from services.summary import summarise
+from services.storage.checkpoints import Checkpoint, Checkpoints
+from services.storage.files import read_file, write_file
+from services.storage.remote import STORAGE
+from services.storage.replication import replicated, restored
+from services.storage.run_folders import find_folder, new_folder
 from services.tracking import Tracker, introduce
 from services.tracking.system import recording_system
 

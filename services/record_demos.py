@@ -9,10 +9,10 @@ import numpy as np
 import tyro
 
 from dmil_core.demonstrations import Demonstration
-from services.command_line import ConfigError, exit_code, parse, suite_settings
-from services.demo_store import open_store
-from services.progress import console
-from services.recordings import FORMS, demonstrations
+from services.cli.arguments import ConfigError, exit_code, parse, suite_settings
+from services.cli.progress import console
+from services.demonstrations.external import FORMS, demonstrations
+from services.demonstrations.store import open_store
 from services.suites.base import Attempt
 from services.suites.registry import open_suite
 

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
-from services.checkpoints import Checkpoint
-from services.command_line import ConfigError, exit_code
-from services.progress import console
-from services.summary import AGAINST_COLLAPSE, Summary, rates, table, table_markdown, write_summary
+from services.cli.arguments import ConfigError, exit_code
+from services.cli.progress import console
+from services.evaluation.summary import AGAINST_COLLAPSE, Summary, rates, table, table_markdown, write_summary
+from services.storage.checkpoints import Checkpoint
 from services.tracking import Tracker
 
 __all__ = ["PAGE", "publish", "run", "show", "write_report"]
@@ -20,11 +20,11 @@ PAGE = "report.html"
 """In a run's report folder."""
 KINDS = {
     "run": "services.reporting.run_report",
-    "compare": "services.reporting.comparison",
+    "compare": "services.sweeps.compare",
     "sub-skills": "services.reporting.sub_skill_report",
     "video": "services.reporting.video",
     "gallery": "services.reporting.gallery",
-    "tables": "services.sweeps.layout",
+    "tables": "services.sweeps.table_formats",
 }
 """What the program draws, and the module that does."""
 

@@ -12,14 +12,14 @@ import tyro
 from dmil_core.errors import RunError
 from dmil_core.networks import unflatten
 from dmil_core.outer_loop import group_gradient, tasks_of
-from services.actors.simulation import SimulationWorker
-from services.checkpoints import Checkpoint
-from services.command_line import exit_code, parse
-from services.demo_store import open_store
-from services.experiment import Experiment
-from services.failures import Failure, read_failure
-from services.progress import console
-from services.runners import LocalRunner
+from services.cli.arguments import exit_code, parse
+from services.cli.progress import console
+from services.demonstrations.store import open_store
+from services.distributed.failures import Failure, read_failure
+from services.distributed.runner import LocalRunner
+from services.distributed.simulation_worker import SimulationWorker
+from services.experiments.experiment import Experiment
+from services.storage.checkpoints import Checkpoint
 
 __all__ = ["Arguments", "run"]
 

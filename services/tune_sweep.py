@@ -16,19 +16,19 @@ import tyro
 from pydantic import ValidationError
 
 from dmil_core.errors import RunError, explain
-from services.cluster import joined
-from services.command_line import ConfigError, Quiet, exit_code, parse
-from services.demo_store import open_store
-from services.experiment import Experiment
-from services.folders import find_folder, new_folder
-from services.progress import Clock, console
-from services.provenance import git_commit, library_versions
-from services.ray_runner import RayRunner
-from services.settings_files import read_yaml
+from services.cli.arguments import ConfigError, Quiet, exit_code, parse
+from services.cli.progress import Clock, console
+from services.cli.yaml_files import read_yaml
+from services.demonstrations.store import open_store
+from services.distributed.cluster import joined
+from services.distributed.ray_runner import RayRunner
+from services.experiments.experiment import Experiment
+from services.storage.provenance import git_commit, library_versions
+from services.storage.run_folders import find_folder, new_folder
 from services.suites.registry import open_suite
 from services.sweeps.folders import MARK, SweepFolder, SweepRecord
-from services.sweeps.layout import publish, show, write_tables
 from services.sweeps.settings import Size, Sweep, planned
+from services.sweeps.table_formats import publish, show, write_tables
 from services.tracking import Tracker, tracking_uri
 from services.tracking.delivery import IDENTITY, Identity
 from services.tracking.links import comparison_link

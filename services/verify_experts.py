@@ -9,12 +9,12 @@ from rich.table import Table
 
 from dmil_core.errors import RunError, WorkError
 from dmil_core.statistics import success_rate
-from services.command_line import ConfigError, Quiet, exit_code, parse, suite_settings
-from services.experiment import RunnerKind, open_runner
-from services.progress import Bar, console
+from services.cli.arguments import ConfigError, Quiet, exit_code, parse, suite_settings
+from services.cli.progress import Bar, console
+from services.experiments.experiment import RunnerKind, open_runner
+from services.rollouts.verification import VerificationRow
 from services.suites.base import TaskSuite
 from services.suites.registry import open_suite
-from services.verification import VerificationRow
 
 __all__ = ["Arguments", "run"]
 

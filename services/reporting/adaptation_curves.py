@@ -13,18 +13,18 @@ from dmil_core.configs import EvaluationConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.errors import explain
 from dmil_core.statistics import Rate, success_rate
-from services.command_line import with_evaluation
-from services.disk import read_file, write_file
-from services.evaluation import Evaluator
-from services.experiment import Experiment
-from services.progress import Bar, console
+from services.cli.arguments import with_evaluation
+from services.cli.progress import Bar, console
+from services.distributed.runner import Runner
+from services.evaluation.evaluator import Evaluator
+from services.evaluation.results import EpisodeResult, ImitationResult, read_rows, write_rows
+from services.experiments.experiment import Experiment
+from services.experiments.finished_run import FinishedRun, UnfinishedError
 from services.reporting.drawing import Picture, colour_of, drawn, panels
-from services.reporting.finished import FinishedRun, UnfinishedError
 from services.reporting.lineup import MOST_TASKS, MismatchError, policy_after
 from services.reporting.page import DataTable, Part, Prose, Section
 from services.reporting.sub_skill_pictures import marker_of
-from services.results import EpisodeResult, ImitationResult, read_rows, write_rows
-from services.runners import Runner
+from services.storage.files import read_file, write_file
 
 __all__ = ["SHOTS", "CurvePlan", "Point", "adaptation_section", "measure", "points"]
 

@@ -10,10 +10,10 @@ from jaxtyping import Int64
 from dmil_core.methods.base import Policy
 from dmil_core.seeding import stream_seed
 from dmil_core.settings import sub_skills_of
-from services.reporting.finished import FinishedRun
+from services.experiments.finished_run import FinishedRun
 from services.reporting.lineup import Lineup, has_sub_skills, policies
 from services.reporting.usage import Usage, usage
-from services.rollouts import record
+from services.rollouts.trials import record
 from services.suites.base import Environment, build_env
 
 __all__ = ["DEMONSTRATIONS", "ROLLOUTS", "Choices", "Timeline", "choices_on"]

@@ -8,11 +8,11 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from dmil_core.settings import MethodConfig
+from services.evaluation.results import EpisodeResult, Split
+from services.evaluation.summary import cells
+from services.experiments.finished_run import FinishedRun
 from services.reporting.drawing import DASHES, Picture, colour_of, drawn, panels, style_of
-from services.reporting.finished import FinishedRun
 from services.reporting.page import Part, Prose, Section
-from services.results import EpisodeResult, Split
-from services.summary import cells
 
 __all__ = ["Panel", "draw_metrics", "draw_success", "training_curves"]
 

@@ -15,7 +15,7 @@ from matplotlib import pyplot
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from services.palette import COLOURS, colour_of
+from services.cli.colours import COLOURS, colour_of
 
 __all__ = ["DASHES", "INK", "Picture", "colour_of", "drawn", "panels", "style_of"]
 

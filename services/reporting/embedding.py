@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 
 from dmil_core.demonstrations import Demonstration, Standardisation
 from dmil_core.settings import sub_skills_of
-from services.progress import Bar
+from services.cli.progress import Bar
 from services.reporting.drawing import Picture, colour_of, drawn, panels
 from services.reporting.lineup import Lineup, has_sub_skills, policies
 from services.reporting.page import Part, Prose, Section

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from services.evaluation.results import EpisodeResult
+from services.experiments.finished_run import FinishedRun
+from services.experiments.replay import Replay, ReplayError, Seen, replaying
 from services.reporting.drawing import Picture, colour_of, drawn, panels
 from services.reporting.film import FORMS, film_of, write_film
-from services.reporting.finished import FinishedRun
 from services.reporting.page import Clip, Commands, DataTable, Part, Prose, Section
-from services.reporting.replay import Replay, ReplayError, Seen, replaying
 from services.reporting.video import camera_of, command, name_of, side_of
-from services.results import EpisodeResult
 from services.suites.base import Measure, measure_of
 
 __all__ = ["draw_episodes", "failures_of_run", "worst_tasks"]

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from services.disk import write_file
 from services.reporting.drawing import colour_of
+from services.rollouts.recording import Film, Frame
+from services.storage.files import write_file
 from services.suites.rendering import View
-from services.watching import Film, Frame
 
 __all__ = ["FORMS", "Form", "FormName", "Side", "compose", "film_of", "write_film"]
 

@@ -13,10 +13,10 @@ from jaxtyping import UInt8
 from matplotlib import pyplot
 
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
-from services.command_line import ConfigError, exit_code, parse
-from services.disk import room_for
-from services.progress import Bar, console
-from services.rollouts import demonstrate
+from services.cli.arguments import ConfigError, exit_code, parse
+from services.cli.progress import Bar, console
+from services.rollouts.trials import demonstrate
+from services.storage.files import room_for
 from services.suites.base import TaskSuite
 from services.suites.registry import open_suite
 from services.suites.rendering import View, picture

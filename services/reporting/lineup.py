@@ -11,9 +11,9 @@ from dmil_core.errors import UserError
 from dmil_core.methods.base import FineTuning, Policy, Standardised
 from dmil_core.methods.registry import method_type
 from dmil_core.settings import sub_skills_of
-from services.experiment import Experiment
-from services.reporting.finished import FinishedRun
-from services.runners import LocalRunner
+from services.distributed.runner import LocalRunner
+from services.experiments.experiment import Experiment
+from services.experiments.finished_run import FinishedRun
 
 __all__ = [
     "ADAPTATIONS",

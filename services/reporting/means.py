@@ -8,8 +8,8 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from services.evaluation.comparison import DIGITS, Cell, Comparison
 from services.reporting.drawing import Picture, colour_of, drawn, panels
-from services.sweeps.cells import DIGITS, Cell, Comparison
 
 __all__ = ["draw_means", "means"]
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from services.disk import write_file
 from services.reporting.drawing import Picture
+from services.storage.files import write_file
 
 __all__ = ["Clip", "Commands", "DataTable", "Part", "Prose", "Section", "write_page"]
 

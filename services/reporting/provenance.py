@@ -3,7 +3,7 @@
 import shlex
 
 from dmil_core.configs import DEFAULT_METHOD
-from services.reporting.finished import FinishedRun
+from services.experiments.finished_run import FinishedRun
 from services.reporting.page import Commands, DataTable, Part, Prose, Section
 from services.reporting.settings import flags, nearest_preset
 

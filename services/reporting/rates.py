@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from dmil_core.statistics import mean_score, success_rate
+from services.evaluation.results import EpisodeResult, Split
+from services.evaluation.summary import AGAINST_COLLAPSE, described, headline
+from services.experiments.finished_run import FinishedRun
 from services.reporting.drawing import INK, Picture, colour_of, drawn, panels
-from services.reporting.finished import FinishedRun
 from services.reporting.page import DataTable, Part, Prose, Section
-from services.results import EpisodeResult, Split
-from services.summary import AGAINST_COLLAPSE, described, headline
 
 __all__ = ["Estimate", "estimates", "rates_of_tasks", "table_of_all"]
 

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import tyro
 
-from services.command_line import ConfigError, parse
-from services.experiment import RunnerKind, open_runner
-from services.progress import Bar, console
+from services.cli.arguments import ConfigError, parse
+from services.cli.progress import Bar, console
+from services.experiments.experiment import RunnerKind, open_runner
+from services.experiments.finished_run import FinishedRun
 from services.report import PAGE
 from services.reporting.adaptation_curves import adaptation_section, measure
 from services.reporting.curves import training_curves
 from services.reporting.embedding import embedding_section
 from services.reporting.failures import failures_of_run
-from services.reporting.finished import FinishedRun
 from services.reporting.lineup import has_sub_skills, line_up
 from services.reporting.page import Section, write_page
 from services.reporting.provenance import episodes_of_run, origin_of_run

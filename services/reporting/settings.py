@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel
 
 from dmil_core.configs import SIZES, ExperimentConfig, preset_of
-from services.reporting.finished import FinishedRun
+from services.experiments.finished_run import FinishedRun
 from services.reporting.page import DataTable, Part, Prose, Section
 
 __all__ = ["Nearest", "flags", "nearest_preset", "settings_of_run"]

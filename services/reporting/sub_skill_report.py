@@ -13,15 +13,15 @@ from pathlib import Path
 import torch
 import tyro
 
-from services.command_line import ConfigError, exit_code, parse
-from services.folders import find_folder
-from services.progress import console
+from services.cli.arguments import ConfigError, exit_code, parse
+from services.cli.progress import console
+from services.experiments.finished_run import FinishedRun
 from services.reporting.embedding import PERPLEXITY, SEED, embedding_section
 from services.reporting.embedding import SHOTS as EMBEDDING_SHOTS
-from services.reporting.finished import FinishedRun
 from services.reporting.lineup import Lineup, has_sub_skills, line_up
 from services.reporting.page import DataTable, Prose, write_page
 from services.reporting.sub_skills import sub_skill_sections
+from services.storage.run_folders import find_folder
 
 __all__ = ["Arguments", "run"]
 

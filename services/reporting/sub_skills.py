@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 
-from services.progress import Bar
+from services.cli.progress import Bar
 from services.reporting.choices import DEMONSTRATIONS, ROLLOUTS, Choices, choices_on
 from services.reporting.lineup import Lineup, has_sub_skills
 from services.reporting.page import DataTable, Part, Prose, Section

@@ -13,12 +13,12 @@ import tyro
 
 from dmil_core.errors import UserError, shown
 from dmil_core.settings import sub_skills_of
-from services.command_line import ConfigError, exit_code, parse
-from services.progress import console
+from services.cli.arguments import ConfigError, exit_code, parse
+from services.cli.progress import console
+from services.evaluation.results import EpisodeResult
+from services.experiments.finished_run import FinishedRun
+from services.experiments.replay import Replay, Seen, replaying
 from services.reporting.film import FORMS, Form, FormName, Side, film_of, write_film
-from services.reporting.finished import FinishedRun
-from services.reporting.replay import Replay, Seen, replaying
-from services.results import EpisodeResult
 from services.suites.rendering import View
 
 __all__ = ["Arguments", "CameraError", "camera_of", "command", "name_of", "run", "side_of"]

@@ -18,8 +18,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dmil_core.configs import EvaluationConfig, ExperimentConfig
 from dmil_core.errors import UserError, explain
-from services.digests import sha256
-from services.disk import inside, read_file, write_file
+from services.storage.checksums import sha256
+from services.storage.files import inside, read_file, write_file
 from services.sweeps.settings import PlannedTrial, Size, Sweep, planned
 
 __all__ = ["MARK", "TRAINED", "SweepError", "SweepFolder", "SweepRecord", "TrialResult", "evaluated", "trained"]

@@ -12,9 +12,9 @@ from pydantic import Field, model_validator
 from dmil_core.configs import EvaluationConfig, ExperimentConfig, SuiteConfig, SuiteName, preset_of
 from dmil_core.seeding import stream
 from dmil_core.settings import Count, NotNegative, Seed, Settings
-from services.command_line import ConfigError, checked, method_named
-from services.results import Split
-from services.settings_files import merged
+from services.cli.arguments import ConfigError, checked, method_named
+from services.cli.yaml_files import merged
+from services.evaluation.results import Split
 from services.suites.registry import open_suite
 
 __all__ = ["Metric", "PlannedTrial", "Resources", "Scale", "Search", "Size", "Sweep", "planned", "row_name"]

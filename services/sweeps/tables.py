@@ -6,9 +6,9 @@ from typing import Literal
 
 from pydantic import BaseModel
 
-from services.command_line import with_evaluation
-from services.published import figure
-from services.sweeps.cells import Cell, Comparison, Contender, Difference, Place, Unpaired
+from services.cli.arguments import with_evaluation
+from services.evaluation.comparison import Cell, Comparison, Contender, Difference, Place, Unpaired
+from services.evaluation.paper_results import figure
 from services.sweeps.folders import SweepFolder
 from services.sweeps.settings import Metric
 

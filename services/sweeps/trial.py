@@ -13,21 +13,21 @@ from filelock import FileLock
 from pydantic import TypeAdapter
 
 from dmil_core.errors import RunError, UserError
-from services.checkpoints import Checkpoint, Checkpoints
-from services.command_line import with_evaluation
-from services.demo_store import DemoStore
-from services.disk import read_file, write_file
-from services.experiment import Experiment
-from services.progress import Clock, console
-from services.ray_runner import RayRunner
-from services.replica import replicated
-from services.reporting.records import read_metrics
-from services.results import EpisodeResult, read_rows
-from services.storage import given_storage
-from services.summary import cells, rates
+from services.cli.arguments import with_evaluation
+from services.cli.progress import Clock, console
+from services.demonstrations.store import DemoStore
+from services.distributed.ray_runner import RayRunner
+from services.evaluation.results import EpisodeResult, read_rows
+from services.evaluation.summary import cells, rates
+from services.experiments.experiment import Experiment
+from services.storage.checkpoints import Checkpoint, Checkpoints
+from services.storage.files import read_file, write_file
+from services.storage.remote import given_storage
+from services.storage.replication import replicated
 from services.sweeps.folders import TRAINED, SweepFolder, TrialResult, evaluated, trained
 from services.sweeps.settings import PlannedTrial
 from services.tracking import Tracker, introduce
+from services.tracking.history import read_metrics
 
 __all__ = ["HELD_OUT", "run_trial", "tracker_of"]
 

@@ -9,11 +9,11 @@ from ray import tune
 from ray.tune import Callback, RunConfig, TuneConfig
 from ray.tune.schedulers import AsyncHyperBandScheduler, TrialScheduler
 
-from services.actors.faults import NoRoomError
-from services.cluster import cpus
-from services.demo_store import data_root
-from services.progress import Bar, console
-from services.storage import STORAGE
+from services.cli.progress import Bar, console
+from services.demonstrations.store import data_root
+from services.distributed.cluster import cpus
+from services.distributed.errors import NoRoomError
+from services.storage.remote import STORAGE
 from services.sweeps.folders import SweepFolder, TrialResult
 from services.sweeps.trial import HELD_OUT, ITERATION, run_trial, tracker_of
 from services.tracking import tracking_uri

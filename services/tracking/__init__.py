@@ -11,7 +11,7 @@ from typing import Any
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import RunError, UserError
-from services.provenance import git_commit, library_versions
+from services.storage.provenance import git_commit, library_versions
 from services.tracking.delivery import Delivery, Identity
 from services.tracking.links import how_to_look, run_link
 from services.tracking.packing import packed

@@ -13,9 +13,9 @@ import tyro
 from tyro.conf import Positional
 
 from dmil_core.errors import RunError, UserError
-from services.command_line import exit_code, parse
-from services.folders import FolderError, find_folder
-from services.progress import console
+from services.cli.arguments import exit_code, parse
+from services.cli.progress import console
+from services.storage.run_folders import FolderError, find_folder
 from services.tracking import in_words, redacted, tracking_uri
 from services.tracking.delivery import Delivery
 from services.tracking.spool import Artifact, Spool

@@ -12,7 +12,7 @@ from filelock import FileLock, Timeout
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dmil_core.errors import RunError, UserError
-from services.disk import read_file, sync, write_file
+from services.storage.files import read_file, sync, write_file
 from services.tracking.sending import next_batch, send
 from services.tracking.spool import Line, read_spool
 

@@ -18,7 +18,7 @@ from dmil_core.demonstrations import Demonstration, digest
 from dmil_core.errors import RunError
 from dmil_core.methods.base import FineTuning, Policy
 from dmil_core.methods.registry import method_type
-from services.checkpoints import Checkpoint
+from services.storage.checkpoints import Checkpoint
 from services.tracking.packing import unpacked
 
 POLICIES_KEPT = 16

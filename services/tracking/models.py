@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dmil_core.configs import EvaluationConfig
-from services.checkpoints import Checkpoint
+from services.storage.checkpoints import Checkpoint
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

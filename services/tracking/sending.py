@@ -5,7 +5,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from services.checkpoints import Checkpoint, CheckpointError
+from services.storage.checkpoints import Checkpoint, CheckpointError
 from services.tracking.models import log_model
 from services.tracking.spool import Artifact, Ended, Line, Measured, Trained
 

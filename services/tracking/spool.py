@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from dmil_core.errors import UserError
-from services.disk import room_for
+from services.storage.files import room_for
 
 __all__ = ["Artifact", "Ended", "Example", "Line", "Measured", "Spool", "SpoolError", "Trained", "read_spool"]
 

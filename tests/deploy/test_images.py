@@ -140,7 +140,11 @@ def test_the_context_has_the_programs_and_no_more():
     packages = tomllib.loads((PROJECT / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"]["packages"]["find"]
     for package in (name.rstrip("*") for name in packages["include"]):
         assert let_through(f"{package}/__init__.py", ignore), package
-    for path in ("services/reporting/templates/page.html", "services/published.json", "tune_configs/em.yaml"):
+    for path in (
+        "services/reporting/templates/page.html",
+        "services/evaluation/paper_results.json",
+        "tune_configs/em.yaml",
+    ):
         assert (PROJECT / path).is_file()
         assert let_through(path, ignore)
     for path in ("data/x", "runs/a/b", ".git/config", "deploy/secrets/ray_token", "tests/conftest.py", "mlflow.db"):

@@ -12,7 +12,7 @@ import jsonschema
 import pytest
 import yaml
 
-from services.actors.simulation import ENVIRONMENTS_KEPT
+from services.distributed.simulation_worker import ENVIRONMENTS_KEPT
 from tests.deploy.command_lines import listening
 from tests.deploy.manifests import (
     DEPLOY,

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from ray.dashboard.modules.reporter.reporter_agent import METRICS_GAUGES
 
-from services.metrics import MEASURES
+from services.distributed.metrics import MEASURES
 from tests.deploy.manifests import DEPLOY, PROJECT, ask, composed, documents
 
 pytestmark = pytest.mark.deploy

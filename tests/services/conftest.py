@@ -20,10 +20,10 @@ from playwright.sync_api import Browser, sync_playwright
 
 from dmil_core.configs import PRESETS, ExperimentConfig
 from services import meta_train
-from services.checkpoints import Checkpoint, Checkpoints
-from services.command_line import exit_code
-from services.demo_store import DemoStore, TaskDemonstrations
-from services.experiment import Experiment, open_runner
+from services.cli.arguments import exit_code
+from services.demonstrations.store import DemoStore, TaskDemonstrations
+from services.experiments.experiment import Experiment, open_runner
+from services.storage.checkpoints import Checkpoint, Checkpoints
 
 PROJECT = Path(__file__).parents[2]
 SECONDS_TO_START = 90

@@ -8,8 +8,8 @@ import pytest
 
 from dmil_core.demonstrations import digest
 from services import collect_demos, meta_train
-from services.demo_store import DemoStore, TaskDemonstrations
-from services.results import EpisodeResult, read_rows
+from services.demonstrations.store import DemoStore, TaskDemonstrations
+from services.evaluation.results import EpisodeResult, read_rows
 
 
 def write_npz(path: Path, parts: list[tuple[np.ndarray, np.ndarray]]) -> str:

@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
+from services.distributed.node_info import NodeFacts, facts
 from services.doctor import Finding, examine
-from services.node_facts import NodeFacts, facts
 
 GOOD = NodeFacts(
     name="one", versions={"python": "3.11.7", "torch": "2.13.0"}, packages="torch==2.13.0", cores=4, cpus=4.0,

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from services import evaluate
-from services.demo_store import DemoStore
-from services.results import EpisodeResult, read_rows
+from services.demonstrations.store import DemoStore
+from services.evaluation.results import EpisodeResult, read_rows
 
 
 @pytest.fixture

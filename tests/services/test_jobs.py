@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.checkpoints import Checkpoints
+from services.storage.checkpoints import Checkpoints
 
 PROJECT = Path(__file__).parents[2]
 pytestmark = pytest.mark.alone  # Ray gives a stopped job three seconds

@@ -14,9 +14,9 @@ import pytest
 from mlflow import MlflowClient
 
 from services import meta_train
-from services.checkpoints import Checkpoint, Checkpoints
-from services.command_line import ConfigError
-from services.results import EpisodeResult
+from services.cli.arguments import ConfigError
+from services.evaluation.results import EpisodeResult
+from services.storage.checkpoints import Checkpoint, Checkpoints
 from services.tracking.models import models_of
 
 LOSSES = {"high_loss_before", "high_loss_after", "low_loss_before", "low_loss_after", "continuity_loss"}

@@ -18,7 +18,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from services.checkpoints import Checkpoints
+from services.storage.checkpoints import Checkpoints
 from services.tracking import Tracker
 
 PROJECT = Path(__file__).parents[2]
@@ -84,8 +84,8 @@ def test_a_cluster_as_the_readme_starts_it_listens_on_loopback(cluster):
 FAILS = """
 import sys
 from services import meta_train
-from services.command_line import exit_code
-from services.experiment import Experiment
+from services.cli.arguments import exit_code
+from services.experiments.experiment import Experiment
 def fail(*arguments):
     raise ZeroDivisionError("made to fail")
 Experiment.evaluate = fail

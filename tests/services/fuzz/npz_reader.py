@@ -13,7 +13,7 @@ import numpy as np
 from mutations import Odd, mutated_bytes
 
 from dmil_core.demonstrations import Demonstration
-from services.npz_demonstrations import read_npz
+from services.demonstrations.npz import read_npz
 
 KITCHEN = Path(__file__).parents[3].parent / "shared" / "data" / "kitchen"
 

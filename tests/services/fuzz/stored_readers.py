@@ -16,9 +16,9 @@ from safetensors.numpy import save
 from dmil_core.configs import PRESETS
 from dmil_core.demonstrations import digest
 from dmil_core.outer_loop import OuterState
-from services.checkpoints import Checkpoint, Checkpoints, Manifest
-from services.demo_store import DemoStore
-from services.digests import sha256, write_listing
+from services.demonstrations.store import DemoStore
+from services.storage.checkpoints import Checkpoint, Checkpoints, Manifest
+from services.storage.checksums import sha256, write_listing
 from services.suites.base import Attempt
 
 

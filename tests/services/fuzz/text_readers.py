@@ -10,9 +10,9 @@ import yaml
 from mutations import Odd, json_bytes, mutated_bytes, mutated_value
 
 from dmil_core.configs import PRESETS, ExperimentConfig
-from services.command_line import config_from
-from services.reporting.records import read_metrics
-from services.results import AdaptationResult, EpisodeResult, read_rows, write_rows
+from services.cli.arguments import config_from
+from services.evaluation.results import AdaptationResult, EpisodeResult, read_rows, write_rows
+from services.tracking.history import read_metrics
 
 
 def settings_yaml(settings: Any) -> bytes:

@@ -11,13 +11,13 @@ from playwright.sync_api import Browser, Page
 
 from dmil_core.configs import preset_of
 from services import meta_train
-from services.checkpoints import Checkpoints
-from services.command_line import checked
-from services.demo_store import DemoStore, data_root
-from services.experiment import Experiment
-from services.reporting.finished import FinishedRun
-from services.runners import LocalRunner
-from services.settings_files import merged
+from services.cli.arguments import checked
+from services.cli.yaml_files import merged
+from services.demonstrations.store import DemoStore, data_root
+from services.distributed.runner import LocalRunner
+from services.experiments.experiment import Experiment
+from services.experiments.finished_run import FinishedRun
+from services.storage.checkpoints import Checkpoints
 from services.tracking import Tracker
 
 EXAMPLE = Path(__file__).parents[3] / "docs" / "examples" / "planar_visits" / "planar_visits.py"

@@ -9,9 +9,9 @@ import numpy as np
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.outer_loop import OuterState
-from services.checkpoints import Checkpoint, Checkpoints, Manifest
-from services.results import AdaptationResult, EpisodeResult, write_rows
-from services.summary import Evaluation, summarise, write_summary
+from services.evaluation.results import AdaptationResult, EpisodeResult, write_rows
+from services.evaluation.summary import Evaluation, summarise, write_summary
+from services.storage.checkpoints import Checkpoint, Checkpoints, Manifest
 
 SPLITS = ("meta-training", "meta-testing")
 TASKS = ("reach", "push", "window-open")

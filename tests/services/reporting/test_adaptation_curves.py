@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from services.experiment import open_runner
+from services.distributed.runner import LocalRunner
+from services.evaluation.results import EpisodeResult, ImitationResult, read_rows
+from services.experiments.experiment import open_runner
+from services.experiments.finished_run import FinishedRun, UnfinishedError
 from services.reporting.adaptation_curves import adaptation_section, measure, points
-from services.reporting.finished import FinishedRun, UnfinishedError
 from services.reporting.lineup import MismatchError, policy_after
 from services.reporting.page import DataTable, Prose, write_page
-from services.results import EpisodeResult, ImitationResult, read_rows
-from services.rollouts import imitation_error
-from services.runners import LocalRunner
+from services.rollouts.trials import imitation_error
 
 TASK = "blue-green-red"
 Trained = Callable[..., FinishedRun]

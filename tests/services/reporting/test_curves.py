@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from dmil_core.dmil_config import DmilConfig
-from services.demo_store import DemoStore
-from services.experiment import Experiment
+from services.demonstrations.store import DemoStore
+from services.evaluation.results import EpisodeResult
+from services.experiments.experiment import Experiment
 from services.reporting.curves import DRAWN, HATCHES, OTHERS, draw_metrics, draw_success
 from services.reporting.drawing import colour_of
-from services.results import EpisodeResult
-from tests.services.courses import alone
+from tests.services.distributed.courses import alone
+from tests.services.experiments.test_methods import LEARNERS, smoke
 from tests.services.reporting.test_rates import episode, shown
-from tests.services.test_methods import LEARNERS, smoke
 
 DMIL = (
     "loss", "high_loss_before", "high_loss_after", "low_loss_before", "low_loss_after", "continuity_loss",

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmil_core.demonstrations import Demonstration
+from services.experiments.finished_run import FinishedRun
 from services.reporting.drawing import Picture, colour_of
 from services.reporting.embedding import embed, embedding_section, thin_out
-from services.reporting.finished import FinishedRun
 from services.reporting.lineup import MismatchError, line_up, policies
 
 TASK = "blue-green-red"

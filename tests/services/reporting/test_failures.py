@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from services import report
-from services.palette import COLOURS
+from services.cli.colours import COLOURS
+from services.distributed.runner import LocalRunner
+from services.evaluation.results import EpisodeResult, write_rows
+from services.experiments.finished_run import FinishedRun
+from services.experiments.replay import Seen
 from services.reporting.drawing import Picture
 from services.reporting.failures import FAILED, SOLVED, draw_episodes, failures_of_run, worst_tasks
-from services.reporting.finished import FinishedRun
 from services.reporting.page import Commands, DataTable, Prose, Section
-from services.reporting.replay import Seen
-from services.results import EpisodeResult, write_rows
-from services.rollouts import Episode
-from services.runners import LocalRunner
+from services.rollouts.recording import Footage, Watched
+from services.rollouts.trials import Episode
 from services.suites.base import Measure
 from services.suites.rendering import RenderingError
-from services.watching import Footage, Watched
 from tests.services.reporting.made_runs import TASKS, make_run
 
 MOST_BYTES = 5_000_000

@@ -8,9 +8,9 @@ import pytest
 from matplotlib.colors import to_rgb
 from PIL import Image, ImageSequence
 
-from services.palette import colour_of
+from services.cli.colours import colour_of
 from services.reporting.film import BORDER, FAILED, FORMS, HELD_SECONDS, SOLVED, Side, compose, film_of, write_film
-from services.watching import Frame
+from services.rollouts.recording import Frame
 
 HEIGHT, WIDTH = 60, 200
 SUB_SKILLS = [0, 0, 2, 2, 2, 1]

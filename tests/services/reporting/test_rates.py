@@ -5,12 +5,12 @@ import pytest
 
 from dmil_core.dmil_config import DmilConfig
 from dmil_core.statistics import mean_score, success_rate
+from services.evaluation.results import EpisodeResult, write_rows
+from services.evaluation.summary import Summary, cells, write_summary
+from services.experiments.finished_run import FinishedRun
 from services.reporting.drawing import Picture
-from services.reporting.finished import FinishedRun
 from services.reporting.page import DataTable, Prose
 from services.reporting.rates import estimates, rates_of_tasks, table_of_all
-from services.results import EpisodeResult, write_rows
-from services.summary import Summary, cells, write_summary
 
 TASKS = {"reach": 7, "push": 2, "door-open": 9}
 """Tasks of meta-training, and how many of ten episodes are successes with one shot; with three shots one more."""

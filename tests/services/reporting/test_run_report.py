@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 
 from services import report
-from services.reporting.finished import FinishedRun
+from services.evaluation.results import write_rows
+from services.experiments.finished_run import FinishedRun
 from services.reporting.page import Commands, DataTable, Prose, Section
 from services.reporting.provenance import episodes_of_run, origin_of_run
 from services.reporting.run_report import write_run_page
 from services.reporting.settings import settings_of_run
-from services.results import write_rows
 
 TITLES = ["Success of each task", "Training curves", "Settings", "Where it comes from", "Episodes"]
 MOST_BYTES = 5_000_000

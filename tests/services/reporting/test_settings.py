@@ -5,7 +5,7 @@ import pytest
 
 from dmil_core.configs import ExperimentConfig, preset_of
 from services import meta_train
-from services.command_line import checked, defaults_from, parse
+from services.cli.arguments import checked, defaults_from, parse
 from services.reporting.settings import flags, nearest_preset
 
 

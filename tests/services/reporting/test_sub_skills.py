@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from dmil_core.methods.base import FineTuning
+from services.distributed.runner import LocalRunner
+from services.evaluation.results import EpisodeResult, read_rows
+from services.experiments.finished_run import FinishedRun
 from services.reporting import sub_skill_report
 from services.reporting.choices import DEMONSTRATIONS, ROLLOUTS, Choices, Timeline, choices_on
 from services.reporting.drawing import COLOURS, Picture, colour_of
-from services.reporting.finished import FinishedRun
 from services.reporting.lineup import MismatchError, line_up, policies
 from services.reporting.page import DataTable
 from services.reporting.sub_skill_pictures import draw_timelines, draw_transitions, draw_usage, on_colour
 from services.reporting.sub_skills import sub_skill_sections
-from services.results import EpisodeResult, read_rows
-from services.runners import LocalRunner
 
 TASK = "blue-green-red"
 Trained = Callable[..., FinishedRun]

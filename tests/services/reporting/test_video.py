@@ -6,8 +6,8 @@ import imageio.v3 as imageio
 import pytest
 
 from services import report
+from services.experiments.finished_run import FinishedRun
 from services.reporting.film import FORMS
-from services.reporting.finished import FinishedRun
 from services.suites.rendering import RenderingError
 
 

@@ -8,11 +8,11 @@ import pytest
 
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError
-from services.rollouts import demonstrate
+from services.rollouts.trials import demonstrate
+from services.rollouts.verification import verify
 from services.suites.inverse_kinematics import Arm, Pose, bounded_least_squares, pose_error
 from services.suites.kitchen import NAMES, SPLITS, KitchenSuite, KitchenTask, UnknownKitchenTaskError, chains, replay
 from services.suites.kitchen_expert import SUB_TASKS, kitchen_model
-from services.verification import verify
 
 mujoco: Any = compiled_mujoco  # compiled, so a type checker sees nothing of it
 

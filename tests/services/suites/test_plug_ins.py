@@ -15,10 +15,10 @@ import pytest
 from dmil_core.configs import SuiteConfig
 from dmil_core.demonstrations import digest
 from services import collect_demos, meta_train
-from services.checkpoints import Checkpoints
-from services.command_line import exit_code
-from services.demo_store import DemoStore
-from services.results import EpisodeResult, read_rows
+from services.cli.arguments import exit_code
+from services.demonstrations.store import DemoStore
+from services.evaluation.results import EpisodeResult, read_rows
+from services.storage.checkpoints import Checkpoints
 from services.suites.registry import open_suite
 
 PROJECT = Path(__file__).parents[3]

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-from services.results import AdaptationResult, EpisodeResult, write_rows
+from services.evaluation.results import AdaptationResult, EpisodeResult, write_rows
 from services.sweeps.folders import SweepFolder, SweepRecord, TrialResult
 from services.sweeps.settings import Sweep
 

@@ -8,7 +8,7 @@ import yaml
 from pydantic import ValidationError
 
 from dmil_core.configs import EvaluationConfig, preset_of
-from services.settings_files import ConfigError
+from services.cli.yaml_files import ConfigError
 from services.sweeps.folders import evaluated, trained
 from services.sweeps.settings import Range, Sweep, planned
 from services.tune_sweep import CONFIGS

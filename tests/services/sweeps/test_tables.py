@@ -10,9 +10,9 @@ import pytest
 
 from dmil_core.settings import sub_skills_of
 from services import report
-from services.sweeps.cells import ComparisonError, Place
+from services.evaluation.comparison import ComparisonError, Place
 from services.sweeps.folders import TrialResult
-from services.sweeps.layout import write_tables
+from services.sweeps.table_formats import write_tables
 from services.sweeps.tables import comparison_of, tables_of
 from tests.services.sweeps.made_up import EPISODES, TASKS, better, make
 
@@ -177,7 +177,7 @@ def test_suites_may_stand_in_the_rows(tmp_path: Path) -> None:
 
 
 def test_a_search_is_ranked_and_its_best_is_a_file_of_settings(tmp_path: Path) -> None:
-    from services.command_line import config_from
+    from services.cli.arguments import config_from
 
     space = {"method.sub_skills": [2, 3, 4, 5], "method.inner_learning_rate": {"low": 1e-3, "high": 1e-2}}
     suite = {"train_tasks": ["reach"], "test_tasks": ["push"]}

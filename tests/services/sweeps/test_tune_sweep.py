@@ -15,10 +15,10 @@ from mlflow.entities import Run
 
 from dmil_core.configs import ExperimentConfig
 from services import tune_sweep
-from services.checkpoints import Checkpoint, Checkpoints
-from services.demo_store import TaskDemonstrations, open_store
-from services.experiment import Experiment, open_runner
-from services.storage import STORAGE
+from services.demonstrations.store import TaskDemonstrations, open_store
+from services.experiments.experiment import Experiment, open_runner
+from services.storage.checkpoints import Checkpoint, Checkpoints
+from services.storage.remote import STORAGE
 from services.sweeps.folders import SweepFolder
 from services.tracking import Tracker
 

@@ -6,7 +6,7 @@ import pytest
 from mlflow import MlflowClient
 
 from dmil_core.errors import RunError
-from services.checkpoints import Checkpoint
+from services.storage.checkpoints import Checkpoint
 from services.tracking import Tracker
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.delivery import BusyError, Delivery, Identity

@@ -18,10 +18,10 @@ from dmil_core.errors import RunError
 from dmil_core.methods.base import FineTuning
 from dmil_core.methods.registry import OURS, method_type
 from services import tracking
-from services.checkpoints import Checkpoint, Checkpoints
-from services.demo_store import DemoStore
-from services.experiment import Experiment
-from services.runners import LocalRunner
+from services.demonstrations.store import DemoStore
+from services.distributed.runner import LocalRunner
+from services.experiments.experiment import Experiment
+from services.storage.checkpoints import Checkpoint, Checkpoints
 from services.tracking import Tracker
 from services.tracking.delivery import Identity
 from services.tracking.imitator import POLICIES_KEPT, Imitator

@@ -10,8 +10,8 @@ from mlflow import MlflowClient
 from playwright.sync_api import Browser, Page, expect
 
 from services import meta_train
-from services.demo_store import DemoStore
-from services.reporting.finished import FinishedRun
+from services.demonstrations.store import DemoStore
+from services.experiments.finished_run import FinishedRun
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.delivery import Identity
 from services.tracking.links import comparison_link, run_link

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from services.disk import DiskFullError
+from services.storage.files import DiskFullError
 from services.tracking import Tracker
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.delivery import Identity

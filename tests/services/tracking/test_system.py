@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from mlflow import MlflowClient
 
-from services.reporting.records import read_metrics
 from services.tracking import Tracker, system
 from services.tracking.delivery import Identity
+from services.tracking.history import read_metrics
 from services.tracking.system import recording_system
 from tests.services.tracking.conftest import records
 

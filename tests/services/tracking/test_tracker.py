@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 from mlflow import MlflowClient
 
-from services import disk, tracking
-from services.checkpoints import Checkpoints
-from services.disk import DiskFullError
+from services import tracking
+from services.storage import files
+from services.storage.checkpoints import Checkpoints
+from services.storage.files import DiskFullError
 from services.tracking import Tracker, redacted
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.delivery import Identity
@@ -41,8 +42,8 @@ def test_a_metric_is_recorded_once_a_step_unless_it_is_measured_anew(tmp_path: P
 def test_closing_on_a_full_disk_does_not_hide_what_ended_the_run(tmp_path: Path, monkeypatch):
     said: list[str] = []
     tracker = Tracker(tmp_path, "an experiment", said.append)
-    usage = disk.shutil.disk_usage(tmp_path)._replace(free=0)
-    monkeypatch.setattr(disk.shutil, "disk_usage", lambda path: usage)
+    usage = files.shutil.disk_usage(tmp_path)._replace(free=0)
+    monkeypatch.setattr(files.shutil, "disk_usage", lambda path: usage)
     with pytest.raises(DiskFullError, match=r"needs .* bytes"):
         tracker.tags({"a": "b"})
     assert not tracker.close("FAILED")

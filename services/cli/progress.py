@@ -1,0 +1,122 @@
+"""How far a run is: one calm screen on a terminal, plain lines every few seconds elsewhere."""
+
+import sys
+import time
+from collections import deque
+from collections.abc import Callable
+from types import TracebackType
+
+from rich.console import Console
+from rich.live import Live
+
+from services.cli.live_view import Figures, Pace, Screen
+
+__all__ = ["Bar", "Clock", "Output", "console"]
+
+LINE_SECONDS = 5.0
+REFRESHES = 2
+"""Of the screen in a second."""
+LATELY_SECONDS = 30.0
+"""The time over which it is told how fast things go."""
+
+
+class Output(Console):
+    """The terminal, or whatever the programs' output goes to."""
+
+    terse = False
+    """Whether plain lines are wanted in place of the screen, and of messages only warnings, results and errors."""
+
+    @property
+    def live(self) -> bool:
+        """Whether there is a screen that can be drawn over."""
+        return self.is_interactive and self.file.isatty() and not self.terse
+
+    def note(self, message: str) -> None:
+        """Print a message that is neither a warning nor a result."""
+        if not self.terse:
+            self.print(message, markup=False)
+
+
+console = Output(highlight=False, soft_wrap=not sys.stdout.isatty(), width=None if sys.stdout.isatty() else 160)
+
+
+class Bar:
+    """The progress of one phase, to be used in a ``with``."""
+
+    def __init__(
+        self, name: str, total: int, done: int = 0, unit: str = "", figures: Callable[[], Figures] | None = None
+    ) -> None:
+        """Show `done` of `total`.
+
+        Args:
+            name: of the phase.
+            total: how much there is to do.
+            done: of it.
+            unit: what is counted, where its rate is of interest.
+            figures: gives what else is to be shown, whenever it is, from another thread.
+        """
+        self._name, self._total, self._done, self._unit, self._text = name, total, done, unit, ""
+        self._figures = figures or (lambda: Figures(at=self._text))
+        self._started, self._line_at, self._told = time.monotonic(), 0.0, -1
+        self._seen = deque([(self._started, done)])
+        self._live: Live | None = None
+
+    def advance(self, steps: int, text: str = "") -> None:
+        """Count `steps` more, and show `text` beside if there are no figures."""
+        self._done += steps
+        self._text = text
+        if self._live is None and (time.monotonic() - self._line_at >= LINE_SECONDS or self._done == self._total):
+            self._line()
+
+    def _pace(self) -> Pace:
+        now = time.monotonic()
+        self._seen.append((now, self._done))
+        while len(self._seen) > 2 and now - self._seen[1][0] > LATELY_SECONDS:
+            self._seen.popleft()
+        before, done = self._seen[0]
+        rate = (self._done - done) / (now - before) if now > before else 0.0
+        return Pace(self._done, self._total, now - self._started, rate, self._unit)
+
+    def _screen(self) -> Screen:
+        return Screen(self._name, self._pace(), self._figures())
+
+    def _line(self) -> None:
+        self._line_at, self._told = time.monotonic(), self._done
+        pace = self._pace()
+        parts = [f"{self._name} {pace.done}/{pace.total}, {pace.in_words}", self._figures().in_words]
+        console.print("; ".join(filter(None, parts)), markup=False)
+
+    def __enter__(self) -> "Bar":
+        """Begin to show."""
+        if console.live:
+            self._live = Live(
+                get_renderable=self._screen, console=console, refresh_per_second=REFRESHES, transient=True
+            )
+            self._live.start(refresh=True)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop showing; a line says how far it came."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+        if self._told != self._done:
+            self._line()
+
+
+class Clock:
+    """Seconds that each phase took, and all together."""
+
+    def __init__(self) -> None:
+        """Start to count."""
+        self.seconds: dict[str, float] = {"total": 0.0}
+        self._began = self._last = time.perf_counter()
+
+    def lap(self, phase: str) -> None:
+        """Note what has passed since the lap before as `phase`."""
+        now = time.perf_counter()
+        self.seconds[phase] = round(now - self._last, 1)
+        self.seconds["total"] = round(now - self._began, 1)
+        self._last = now

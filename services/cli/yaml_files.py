@@ -1,0 +1,88 @@
+"""Settings from YAML files: read with care, and put in the place of others."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from dmil_core.errors import UserError, shown
+from services.storage.files import read_file
+
+__all__ = ["ConfigError", "merged", "read_yaml"]
+
+MOST_BYTES = 2**16
+"""In a file of settings; PyYAML may need a second for so many."""
+DEEPEST = 20
+MOST_CHARACTERS = 500
+"""Of what PyYAML says."""
+
+
+class ConfigError(UserError):
+    """A setting that is unknown or has an impossible value."""
+
+
+def merged(settings: Mapping[str, Any], given: Mapping[Any, Any], origin: str, prefix: str = "") -> dict[str, Any]:
+    """Return `settings`, by section, with those that are given in their place.
+
+    Args:
+        settings: all that there are.
+        given: some of them.
+        origin: of what is given, for messages.
+        prefix: of the section's name.
+
+    Raises:
+        ConfigError: for one that there is not.
+    """
+    found = dict(settings)
+    for key, value in given.items():
+        if key not in found:
+            named = key if isinstance(key, str) and len(key) < 50 else shown(key)
+            raise ConfigError(f"{origin}: got the unknown key {prefix}{named}; wanted one of {', '.join(found)}")
+        if isinstance(found[key], dict):
+            if not isinstance(value, dict):
+                raise ConfigError(f"{origin}: {prefix}{key}: got {shown(value)}; wanted keys: {', '.join(found[key])}")
+            value = merged(found[key], value, origin, f"{prefix}{key}.")
+        found[key] = value
+    return found
+
+
+def read_yaml(file: Path, flag: str) -> dict[Any, Any]:
+    """Return the keys and values of a file.
+
+    Raises:
+        ConfigError: names `flag` and the file that is none, or is too large, nested or damaged to be read.
+    """
+    try:
+        loader = _PlainLoader(read_file(file, MOST_BYTES).decode())
+        try:
+            given = loader.get_single_data()
+        finally:
+            loader.dispose()
+    # Besides its own errors, PyYAML lets through what comes of dates, numbers and tags that are none.
+    except (OSError, yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError) as error:
+        raise ConfigError(f"{flag}: got {file}, {_cut(str(error))}; wanted a readable YAML file") from error
+    if not isinstance(given, dict):
+        raise ConfigError(f"{flag}: got {file} with {type(given).__name__} in it; wanted keys with values")
+    return given
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Refuses aliases, a few lines of which stand for more than any memory holds, and deep nesting."""
+
+    depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent) or self.depth == DEEPEST:
+            mark = self.peek_event().start_mark
+            raise yaml.MarkedYAMLError(
+                problem="found an alias or deep nesting, which no setting needs", problem_mark=mark
+            )
+        self.depth += 1
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]}..."

@@ -1,0 +1,158 @@
+"""Where an experiment's demonstrations come from: the store, data sets of one's own, or the scripted experts."""
+
+from collections import Counter
+from collections.abc import Generator, Sequence
+from contextlib import closing
+
+from dmil_core.configs import ExperimentConfig
+from dmil_core.demonstrations import DemonstrationError
+from services.cli.live_view import Figures
+from services.cli.progress import Bar
+from services.demonstrations.external import check_dimensions, demonstrations, places_of
+from services.demonstrations.store import DemoStore, TaskDemonstrations
+from services.distributed.failures import keeping_failures
+from services.distributed.runner import Runner
+from services.suites.base import Attempt, TaskSuite
+
+__all__ = ["DemonstrationCollection"]
+
+CHUNK = 10
+"""Attempts of an expert in one call to a simulation worker."""
+PATIENCE = 10
+"""So many attempts for each wanted demonstration, then the expert is given up."""
+
+
+class DemonstrationCollection:
+    """The demonstrations of all tasks of an experiment."""
+
+    def __init__(self, config: ExperimentConfig, suite: TaskSuite, store: DemoStore) -> None:
+        """Find out where they are; nothing is read or made yet.
+
+        Args:
+            config: of the experiment.
+            suite: of the experiment.
+            store: where the experts' demonstrations are, or will be.
+
+        Raises:
+            DemonstrationError: for a source of demonstrations that there is not, or that is of no task of the suite.
+        """
+        self._config, self._suite, self._store = config, suite, store
+        self._names = list(dict.fromkeys((*suite.train_tasks, *suite.test_tasks)))
+        self._places = self._find_places()
+
+    def collect(self, runner: Runner) -> dict[str, TaskDemonstrations]:
+        """Return every task's demonstrations, letting the experts make those that are not in the store.
+
+        The first successes in the order of the attempts' numbers are kept, so the outcome does not depend on who
+        simulates what.
+
+        Raises:
+            DemonstrationError: if an expert hardly ever succeeds, a task has none, or a data set cannot be used.
+        """
+        settings = self._config.demonstrations
+        found = self._recorded()
+        ids = {task: self._store.dataset_id(task, self._suite, settings) for task in self._names if task not in found}
+        missing = []
+        for task, dataset_id in ids.items():
+            if (dataset := self._store.load(dataset_id, task)) is not None:
+                found[task] = self._checked(dataset)
+            elif self._suite.expert(task) is None:
+                raise DemonstrationError(
+                    f"demonstrations.source: got nothing for {task}, which has no scripted expert; wanted a data set: "
+                    f"--demos minari:{task}=ID"
+                )
+            else:
+                missing.append(task)
+        with closing(self._attempt(runner, missing)) as made:  # whatever happens here, its progress is off the screen
+            for task, attempts in made:
+                solved = [index for index, attempt in enumerate(attempts) if attempt.solved_at is not None]
+                kept = solved[: settings.per_task]
+                found[task] = self._store.save(
+                    ids[task],
+                    task,
+                    [attempts[index] for index in kept],
+                    failed=kept[-1] + 1 - len(kept),
+                    settings={"protocol": self._suite.protocol, **settings.model_dump()},
+                )
+        return {task: found[task] for task in self._names}
+
+    def _checked(self, dataset: TaskDemonstrations) -> TaskDemonstrations:
+        """Return a stored data set that fits the suite, which may have been changed since."""
+        try:
+            check_dimensions(dataset.demonstrations[0], self._suite)
+        except DemonstrationError as error:
+            raise DemonstrationError(
+                f"{self._store.root / dataset.id}: {error}; remove it, or name in the suite's protocol what has changed"
+            ) from error
+        return dataset
+
+    def _find_places(self) -> dict[str, str]:
+        """Return where the demonstrations of those tasks are that the settings name a data set for."""
+        if self._config.demonstrations.source == "expert":
+            return {}
+        places = places_of(self._config.demonstrations.source)
+        if unknown := [task for task in places if task not in self._names]:
+            raise DemonstrationError(
+                f"demonstrations.source: got data sets of {', '.join(unknown)}; {self._suite.name} has the tasks "
+                f"{', '.join(self._names)}; name the task that a data set is of: TASK=ID"
+            )
+        return places
+
+    def _recorded(self) -> dict[str, TaskDemonstrations]:
+        """Read the data sets that the settings name."""
+        settings, evaluation = self._config.demonstrations, self._config.evaluation
+        found = {task: demonstrations(task, at, self._suite, settings.per_task) for task, at in self._places.items()}
+        support = max(evaluation.shots) * evaluation.support_draws
+        for task, dataset in found.items():
+            wanted = settings.held_out + 1 if task in self._suite.train_tasks else support
+            if (got := len(dataset.demonstrations)) < wanted:
+                raise DemonstrationError(
+                    f"{dataset.id}: got {got} demonstrations of {task}; wanted at least {wanted}: {support} for "
+                    f"{evaluation.support_draws} support sets of {max(evaluation.shots)}, and for a meta-training task "
+                    "one more than demonstrations.held_out; record more, or lower that, evaluation.shots or "
+                    "evaluation.support_draws"
+                )
+        return found
+
+    def _attempt(self, runner: Runner, tasks: Sequence[str]) -> Generator[tuple[str, list[Attempt]]]:
+        """Yield each task's attempts as soon as enough are successes, in the order of their numbers."""
+        if not tasks:
+            return
+        settings = self._config.demonstrations
+        attempts: dict[str, list[Attempt]] = {task: [] for task in tasks}
+
+        def lacking(task: str) -> int:
+            return settings.per_task - sum(attempt.solved_at is not None for attempt in attempts[task])
+
+        at = ""
+
+        def figures() -> Figures:
+            return Figures(workers=runner.staff, at=at)
+
+        with Bar("collecting", len(tasks) * settings.per_task, 0, "demonstrations", figures) as bar:
+            while attempts:
+                calls = []
+                for task in attempts:
+                    first = len(attempts[task])
+                    if first >= PATIENCE * settings.per_task:
+                        raise DemonstrationError(
+                            f"task {task}: its expert solved {settings.per_task - lacking(task)} of {first} attempts; "
+                            f"wanted {settings.per_task} demonstrations; take less noise or a longer horizon"
+                        )
+                    for start in range(first, first + lacking(task), CHUNK):
+                        numbers = range(start, min(start + CHUNK, first + lacking(task)))
+                        calls.append((task, numbers, settings))
+                results: dict[int, list[Attempt]] = {}
+                left = Counter(task for task, _, _ in calls)
+                with keeping_failures(self._store.root, self._config):
+                    for index, made in runner.simulate("attempts", calls):
+                        task = calls[index][0]
+                        results[index] = made
+                        left[task] -= 1
+                        at = task
+                        bar.advance(sum(attempt.solved_at is not None for attempt in made))
+                        if not left[task]:
+                            own = [number for number, call in enumerate(calls) if call[0] == task]
+                            attempts[task] += [attempt for number in own for attempt in results.pop(number)]
+                            if lacking(task) <= 0:
+                                yield task, attempts.pop(task)

@@ -1,0 +1,198 @@
+"""Demonstrations that somebody else has recorded: Minari data sets, D4RL's HDF5 files, npz files (docs/data.md)."""
+
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+from gymnasium.spaces import Box
+from jaxtyping import Float32
+from minari import MinariDataset
+from minari.storage import get_dataset_path
+
+from dmil_core.demonstrations import Demonstration, DemonstrationError, digest
+from services.demonstrations.npz import read_npz
+from services.demonstrations.store import TaskDemonstrations, data_root
+from services.storage.files import inside
+from services.suites.base import TaskSuite
+
+__all__ = ["FORMS", "Recording", "check_dimensions", "demonstrations", "misfits", "places_of", "read_recordings"]
+
+FORMS = ("minari", "hdf5", "npz")
+"""What data sets may be: an id of Minari's, a file as D4RL has them, a file of arrays."""
+MOST_BYTES = 2**32
+"""Of an HDF5 file's arrays."""
+VERSION = re.compile(r"-v\d+$")
+"""What a Minari id ends with."""
+
+
+class Recording(NamedTuple):
+    """One episode, as recorded."""
+
+    observations: Float32[np.ndarray, "steps obs_dim"]
+    """Of dictionaries: all parts one after the other, by their names in alphabetical order, inner ones likewise."""
+    actions: Float32[np.ndarray, "steps action_dim"]
+    reward: float | None
+    """The sum over the episode, where rewards are recorded."""
+    success: bool | None
+    """Whether some step was a success by its info, where that is recorded."""
+
+
+def places_of(source: str) -> dict[str, str]:
+    """Return where the demonstrations of each task are, from ``minari:ID,TASK=ID`` and the like.
+
+    Raises:
+        DemonstrationError: for another form, or a task named twice.
+    """
+    form, _, rest = source.partition(":")
+    if form not in FORMS or not all(rest.split(",")):
+        raise DemonstrationError(
+            f"demonstrations.source: got {source}; wanted expert, or one of {', '.join(FORMS)} and a list: "
+            "minari:ID,ID, each with TASK= before it where its last part is not the task's name"
+        )
+    places: dict[str, str] = {}
+    for part in rest.split(","):
+        task, _, place = part.rpartition("=")
+        task = task or VERSION.sub("", Path(place).name.removesuffix(".npz").removesuffix(".hdf5"))
+        if task in places:
+            raise DemonstrationError(f"demonstrations.source: got the task {task} twice; wanted one data set for each")
+        places[task] = f"{form}:{place}"
+    return places
+
+
+def read_recordings(place: str) -> list[Recording]:
+    """Read the episodes of a data set.
+
+    Args:
+        place: ``minari:ID``, ``hdf5:PATH`` or ``npz:PATH``.
+
+    Raises:
+        DemonstrationError: names the data set, and what of it cannot be read.
+    """
+    form, _, path = place.partition(":")
+    if form == "npz":
+        return [Recording(one.observations, one.actions, None, None) for one in read_npz(Path(path), "recorded")]
+    try:
+        return _read_minari(path) if form == "minari" else _read_hdf5(Path(path))
+    except DemonstrationError as error:
+        raise DemonstrationError(f"{place}: {error}") from error
+    # What h5py and Minari raise of files that are not what they look like.
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError, AssertionError) as error:
+        raise DemonstrationError(
+            f"{place}: got {type(error).__name__}, {error}; wanted a data set as docs/data.md describes"
+        ) from error
+
+
+def demonstrations(task: str, place: str, suite: TaskSuite, most: int) -> TaskDemonstrations:
+    """Read the demonstrations of a task of `suite`, at most so many.
+
+    Raises:
+        DemonstrationError: names the episode that cannot be learned from, or the dimensions that do not fit.
+    """
+    state_of = getattr(suite, "state_of", lambda observations: observations)
+    found = []
+    for index, recording in enumerate(read_recordings(place)[:most]):
+        try:
+            observations = np.ascontiguousarray(state_of(recording.observations), np.float32)
+            demonstration = Demonstration(f"{index:03d}", task, observations, recording.actions)
+            check_dimensions(demonstration, suite)
+        except DemonstrationError as error:
+            raise DemonstrationError(f"{place}: episode {index}: {error}") from error
+        found.append(demonstration)
+    return TaskDemonstrations(place, tuple(found), 0, digest(found))
+
+
+def check_dimensions(demonstration: Demonstration, suite: TaskSuite) -> None:
+    """See whether a demonstration has the suite's dimensions.
+
+    Raises:
+        DemonstrationError: if it has not.
+    """
+    for misfit in misfits(demonstration, suite):
+        raise DemonstrationError(misfit)
+
+
+def misfits(demonstration: Demonstration, suite: TaskSuite) -> Iterator[str]:
+    """Yield in words which of a demonstration's dimensions are not the suite's."""
+    for field, wanted in (("observations", suite.obs_dim), ("actions", suite.action_dim)):
+        if (got := getattr(demonstration, field).shape[1]) != wanted:
+            yield f"{field}: got {got} numbers a step; {suite.name} wants {wanted}"
+
+
+def _read_minari(dataset_id: str) -> list[Recording]:
+    folder = inside(data_root(), dataset_id) / "data"
+    if not folder.exists():
+        folder = get_dataset_path(dataset_id) / "data"
+    if not folder.exists():
+        raise DemonstrationError(
+            f"got nothing at {folder}, nor in {data_root()}; wanted a data set; minari download {dataset_id}"
+        )
+    data = MinariDataset(folder)
+    if not isinstance(data.action_space, Box):
+        raise DemonstrationError(f"actions: got the space {data.action_space}; wanted a Box")
+    recordings = []
+    for episode in data.iterate_episodes():
+        steps = len(episode.actions)
+        success = episode.infos.get("success") if isinstance(episode.infos, dict) else None
+        recordings.append(
+            Recording(
+                _flat(episode.observations)[:steps],
+                np.asarray(episode.actions, np.float32),
+                float(np.sum(episode.rewards)),
+                None if success is None else bool(np.any(success)),
+            )
+        )
+    return recordings
+
+
+def _flat(observations: Any) -> Float32[np.ndarray, "steps obs_dim"]:
+    if isinstance(observations, Mapping):
+        return np.concatenate([_flat(observations[name]) for name in sorted(observations)], axis=1)
+    if not isinstance(observations, np.ndarray) or observations.dtype.kind not in "fiu":
+        raise DemonstrationError(
+            f"observations: got {type(observations).__name__}; wanted arrays of numbers (Box), or dictionaries of them"
+        )
+    return observations.reshape(len(observations), -1).astype(np.float32)
+
+
+def _read_hdf5(path: Path) -> list[Recording]:
+    with h5py.File(path) as file:
+        observations, actions = (_array(file, name, 2) for name in ("observations", "actions"))
+        if len(observations) != len(actions):
+            raise DemonstrationError(
+                f"got {len(observations)} observations and {len(actions)} actions; wanted as many of both"
+            )
+        ends = np.zeros(len(actions), bool)
+        for name in {"terminals", "timeouts"} & set(file):
+            marks = _array(file, name, 1).astype(bool)
+            if len(marks) != len(ends):
+                raise DemonstrationError(f"{name}: got {len(marks)} for {len(ends)} actions; wanted one each")
+            ends |= marks
+        rewards = _array(file, "rewards", 1) if "rewards" in file else None
+    if not ends.any():
+        raise DemonstrationError("got neither terminals nor timeouts that mark an episode's last step; wanted either")
+    cuts = np.flatnonzero(ends) + 1  # what follows the last mark is no whole episode
+    parts = [slice(start, end) for start, end in zip([0, *cuts[:-1].tolist()], cuts.tolist(), strict=True)]
+    return [
+        Recording(
+            observations[part].astype(np.float32),
+            actions[part].astype(np.float32),
+            None if rewards is None else float(rewards[part].sum()),
+            None,
+        )
+        for part in parts
+    ]
+
+
+def _array(file: h5py.File, name: str, axes: int) -> np.ndarray:
+    array = file[name]
+    if not isinstance(array, h5py.Dataset) or array.is_virtual or array.external or array.file != file:
+        raise DemonstrationError(f"{name}: got no array of this file; wanted one")
+    if array.dtype.kind not in "fiub" or array.ndim != axes or array.nbytes > MOST_BYTES:
+        raise DemonstrationError(
+            f"{name}: got {array.dtype} of the shape {array.shape}; wanted numbers with {axes} axes, at most "
+            f"{MOST_BYTES} bytes"
+        )
+    return array[()]

@@ -1,0 +1,169 @@
+"""Demonstrations in npz files: numpy's own form, read without trust in it.
+
+A file holds ``observations`` (steps, dimensions) and ``actions`` (steps, dimensions) of all demonstrations, one after
+the other, and ``episode_lengths`` (demonstrations); it may hold ``tasks``, names of what is done in them.
+"""
+
+import io
+import math
+import re
+import zipfile
+import zlib
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from dmil_core.demonstrations import Demonstration, DemonstrationError
+from dmil_core.errors import shown
+from services.storage.files import read_file
+
+__all__ = ["read_npz"]
+
+FORMS = {"observations": ("f", 2), "actions": ("f", 2), "episode_lengths": ("iu", 1), "tasks": ("U", 1)}
+"""Of each array, the kinds of numbers and the number of axes."""
+OPTIONAL = {"tasks"}
+MOST_ARCHIVE = 2**28
+"""Bytes of a file."""
+MOST_ARRAYS = 2**29
+"""Bytes of its arrays together."""
+MOST_DEMONSTRATIONS = 10**5
+MOST_PACKED = 200
+"""Bytes of an array for each byte in the file; demonstrations have some 2."""
+MOST_DIRECTORY = 2**12
+"""Bytes of an archive's directory; a member takes some 60."""
+
+END = b"PK\x05\x06"
+"""Begins the 22 bytes that end an archive without a comment."""
+END_64 = b"PK\x06\x07"
+"""Begins the 20 bytes before, in an archive of over 4 GB or 65535 members."""
+HEADER = re.compile(
+    rb"\{ ?'descr': ?'([<|=]?[fiuU]\d{1,9})', ?'fortran_order': ?(?:False|True), ?"
+    rb"'shape': ?\((\d{1,18}(?:, ?\d{1,18})*),?\),? ?\} *\n"
+)
+"""Of an array as numpy writes it."""
+
+
+class _Header(NamedTuple):
+    dtype: np.dtype
+    shape: tuple[int, ...]
+
+
+def read_npz(path: Path, task: str, obs_dim: int | None = None) -> list[Demonstration]:
+    """Read the demonstrations of one task.
+
+    Args:
+        path: of the file.
+        task: the task's name.
+        obs_dim: how many of the first columns of ``observations`` to keep, where goals follow the state; all if none.
+
+    Raises:
+        DemonstrationError: names the file, and the array or the demonstration that cannot be used. Archives that
+            unpack to more than is sane are refused before they are unpacked.
+    """
+    try:
+        arrays = _read_arrays(read_file(path, MOST_ARCHIVE))
+        observations, actions, lengths = (arrays[name] for name in ("observations", "actions", "episode_lengths"))
+        _check_lengths(lengths, len(observations), len(actions))
+        if obs_dim is not None and not 0 < obs_dim <= observations.shape[1]:
+            raise DemonstrationError(
+                f"observations: got {observations.shape[1]} columns; wanted the first {obs_dim} of them"
+            )
+        ends = np.cumsum(lengths.astype(np.int64)).tolist()
+        with np.errstate(over="ignore"):  # what does not fit becomes infinite, and is refused
+            observations = np.ascontiguousarray(observations[:, :obs_dim], np.float32)
+            actions = np.ascontiguousarray(actions, np.float32)
+        return [
+            Demonstration(f"{index:03d}", task, observations[start:end], actions[start:end])
+            for index, (start, end) in enumerate(zip([0, *ends[:-1]], ends, strict=True))
+        ]
+    # What zipfile raises of damaged archives; NotImplementedError and RuntimeError for what it does not read.
+    except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError) as error:
+        known = isinstance(error, DemonstrationError)
+        got = str(error) if known else f"got {type(error).__name__}, {error}; wanted an npz file as numpy writes it"
+        raise DemonstrationError(f"{path}: {got}") from error
+
+
+def _check_lengths(lengths: np.ndarray, observations: int, actions: int) -> None:
+    few = 1 <= len(lengths) <= MOST_DEMONSTRATIONS
+    if not few or (lengths < 1).any() or (lengths > observations).any() or not lengths.sum() == observations == actions:
+        raise DemonstrationError(
+            f"episode_lengths: got {shown(lengths[:10].tolist())} for {observations} observations and {actions} "
+            f"actions; wanted as many of both as the lengths together, each at least 1, of 1 to {MOST_DEMONSTRATIONS} "
+            "demonstrations"
+        )
+
+
+def _read_arrays(content: bytes) -> dict[str, np.ndarray]:
+    _check_end(content)
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = archive.infolist()
+        _check_members(members)
+        return {name: _read_array(archive, member, name) for member in members for name in [_name(member)]}
+
+
+def _check_end(content: bytes) -> None:
+    """Look at the size of the directory before `zipfile` makes an object of each of its entries."""
+    end = content[-22:]
+    directory = int.from_bytes(end[12:16], "little")
+    if end[:4] != END or end[20:] != b"\0\0" or content[-42:-38] == END_64 or directory > MOST_DIRECTORY:
+        raise DemonstrationError(
+            f"got no archive of a few arrays, with a directory of at most {MOST_DIRECTORY} bytes at its end"
+        )
+
+
+def _check_members(members: list[zipfile.ZipInfo]) -> None:
+    names = [member.filename for member in members]
+    wanted = {f"{name}.npy" for name in FORMS}
+    if len(set(names)) != len(names) or not {f"{name}.npy" for name in FORMS.keys() - OPTIONAL} <= set(names) <= wanted:
+        raise DemonstrationError(f"got the members {shown(names)}; wanted {', '.join(sorted(wanted))}, each once")
+    for member in members:
+        if member.flag_bits & 1 or member.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+            raise DemonstrationError(
+                f"{_name(member)}: got it encrypted or packed in an odd way; wanted what numpy.savez writes"
+            )
+        if member.file_size > MOST_PACKED * member.compress_size + 2**16:
+            raise DemonstrationError(
+                f"{_name(member)}: got {member.file_size} bytes packed into {member.compress_size}; wanted at most "
+                f"{MOST_PACKED} for one"
+            )
+    if (total := sum(member.file_size for member in members)) > MOST_ARRAYS:
+        raise DemonstrationError(f"got arrays of {total} bytes; wanted at most {MOST_ARRAYS}; split the file")
+
+
+def _name(member: zipfile.ZipInfo) -> str:
+    return member.filename.removesuffix(".npy")
+
+
+def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str) -> np.ndarray:
+    """Return an array, whose header is found to be true before numpy sees it."""
+    with archive.open(member) as file:
+        content = file.read(member.file_size)  # without a number it would unpack more, and only then cut off
+    header = _header(content, name)
+    kinds, axes = FORMS[name]
+    if header.dtype.kind not in kinds or len(header.shape) != axes:
+        raise DemonstrationError(
+            f"{name}: got {header.dtype} of the shape {header.shape}; wanted {axes} axes and a type of the kind "
+            f"{' or '.join(kinds)}"
+        )
+    return np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
+
+
+def _header(content: bytes, name: str) -> _Header:
+    """Read what the first bytes say of an array.
+
+    Raises:
+        ValueError: if it is not as numpy writes it, or the array would have another size than there is.
+    """
+    size = int.from_bytes(content[8:10], "little")
+    found = HEADER.fullmatch(content[10 : 10 + size])
+    if content[:8] != b"\x93NUMPY\x01\x00" or found is None:
+        got = shown(content[10:110].decode("latin1"))
+        raise DemonstrationError(f"{name}: got the header {got}; wanted numbers or text in numpy's format 1.0")
+    header = _Header(np.dtype(found[1].decode()), tuple(map(int, found[2].split(b","))))
+    wanted = math.prod(header.shape) * header.dtype.itemsize
+    if (there := len(content) - 10 - size) != wanted:
+        raise DemonstrationError(
+            f"{name}: got {there} bytes for {header.dtype} of the shape {header.shape}; wanted {wanted}"
+        )
+    return header

@@ -1,0 +1,284 @@
+"""Demonstrations on disk: one Minari data set a task, under a data root that Minari's own tools can read.
+
+``MINARI_DATASETS_PATH=data minari list local`` shows what is there.
+"""
+
+import errno
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium
+import h5py
+import minari
+import numpy as np
+from minari.data_collector import EpisodeBuffer
+from minari.dataset.minari_storage import MinariStorage
+from pydantic import BaseModel, Field, ValidationError
+
+from dmil_core.configs import DemonstrationConfig
+from dmil_core.demonstrations import Demonstration, DemonstrationError, digest
+from dmil_core.errors import explain
+from services.cli.progress import console
+from services.storage.checksums import check_listing, write_listing
+from services.storage.files import inside, read_file, room_for, sync
+from services.storage.remote import Storage, given_storage
+from services.suites.base import Attempt, TaskSuite
+
+__all__ = ["DemoStore", "TaskDemonstrations", "data_root", "open_store"]
+
+LIBRARIES = ("gymnasium", "gymnasium-robotics", "metaworld", "minari", "mujoco", "numpy")
+DIGESTS, ARRAYS, METADATA = "SHA256SUMS", "data/main_data.hdf5", "data/metadata.json"
+MOST_ARRAYS = 2**32
+"""Bytes of a data set's file of arrays."""
+MOST_METADATA = 2**20
+FILES = {ARRAYS: MOST_ARRAYS, METADATA: MOST_METADATA}
+
+
+@dataclass(frozen=True)
+class TaskDemonstrations:
+    """One task's data set: its demonstrations, how many attempts failed, and the SHA-256 of its arrays."""
+
+    id: str
+    demonstrations: tuple[Demonstration, ...]
+    failed: int
+    digest: str
+
+
+class _Metadata(BaseModel):
+    """What we read of Minari's ``metadata.json``."""
+
+    total_episodes: Annotated[int, Field(ge=1, le=10**6)]
+    failed: Annotated[int, Field(ge=0)]
+    digest: str
+
+
+def data_root() -> Path:
+    """Return ``DMIL_DATA``, or ``data`` in the working directory."""
+    return Path(os.environ.get("DMIL_DATA") or "data")
+
+
+class DemoStore:
+    """The data sets under one data root."""
+
+    def __init__(self, root: Path, storage: Storage | None = None) -> None:
+        """Use the data sets under `root`, which is made with the first of them.
+
+        Args:
+            root: the folder.
+            storage: data sets that are not under the root are fetched from here, and new ones are copied to it.
+        """
+        self.root = root.resolve()
+        self._storage = storage
+
+    @staticmethod
+    def dataset_id(task: str, suite: TaskSuite, config: DemonstrationConfig) -> str:
+        """Return the Minari id of a task's demonstrations: other settings, other id."""
+        settings = {"protocol": suite.protocol, **config.model_dump(exclude={"held_out", "source"})}
+        key = hashlib.sha256(json.dumps([task, settings], sort_keys=True).encode()).hexdigest()[:10]
+        return f"{suite.family}/{task}/scripted-{key}-v2"
+
+    def load(self, dataset_id: str, task: str) -> TaskDemonstrations | None:
+        """Read a task's demonstrations, or `None` if they are not collected yet.
+
+        What its digests do not vouch for never reaches the HDF5 library, which does not withstand every file.
+
+        Raises:
+            DemonstrationError: if the data set is damaged, lies outside the root or holds what cannot be learned from.
+        """
+        path = self.root / dataset_id
+        try:
+            if not inside(self.root, dataset_id).exists() and not self._fetched(dataset_id):
+                return None
+            check_listing(path, DIGESTS, FILES)
+            metadata = _Metadata.model_validate_json(read_file(path / METADATA, MOST_METADATA))
+            demonstrations = tuple(
+                Demonstration(f"{index:03d}", task, observations[:-1], actions)
+                for index, (observations, actions) in enumerate(_read_episodes(path / ARRAYS, metadata.total_episodes))
+            )
+        except ValidationError as error:
+            raise self._damaged(path / METADATA, "; ".join(explain(error, "metadata").splitlines())) from error
+        except DemonstrationError as error:
+            raise DemonstrationError(f"{path / ARRAYS}: {error}") from error
+        except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:  # the last four are h5py's
+            raise self._damaged(path, f"{type(error).__name__}: {error}") from error
+        found = digest(demonstrations)
+        if metadata.digest != found:
+            raise self._damaged(path, f"arrays with the SHA-256 {found[:12]}, not the one in its metadata")
+        return TaskDemonstrations(dataset_id, demonstrations, metadata.failed, found)
+
+    def seed_of(self, dataset_id: str, number: int) -> int:
+        """Return the seed of the attempt that a scripted expert's demonstration is, by its number in the data set.
+
+        Raises:
+            DemonstrationError: if the data set is damaged, or lies outside the root.
+        """
+        path = self.root / dataset_id
+        try:
+            check_listing(inside(self.root, dataset_id), DIGESTS, FILES)
+            with h5py.File(path / ARRAYS) as file:
+                return int(np.asarray(file[f"episode_{number}"].attrs["seed"]).item())
+        except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+            raise self._damaged(path, f"{type(error).__name__}: {error}") from error
+
+    @staticmethod
+    def _damaged(path: Path, got: str) -> DemonstrationError:
+        return DemonstrationError(
+            f"{path}: got {got}; wanted a whole data set as collect_demos writes it; remove it and collect again"
+        )
+
+    def save(
+        self,
+        dataset_id: str,
+        task: str,
+        successes: Sequence[Attempt],
+        failed: int,
+        settings: dict[str, Any],
+        algorithm: str = "scripted expert",
+    ) -> TaskDemonstrations:
+        """Write a task's demonstrations beside, then rename: a data set is there whole, or not at all.
+
+        Where another program was faster, its data set is taken: whoever collects makes the same one.
+
+        Raises:
+            DemonstrationError: for an attempt that cannot be learned from. One step is enough for a demonstration.
+            DiskFullError: for want of space; nothing is kept then.
+        """
+        path = self.root / dataset_id
+        demonstrations = tuple(
+            Demonstration(f"{index:03d}", task, attempt.observations[:-1], attempt.actions)
+            for index, attempt in enumerate(successes)
+        )
+        metadata = {
+            "dataset_id": dataset_id,
+            "minari_version": minari.__version__,
+            "algorithm_name": algorithm,
+            "description": "reward 1 at the step that solves the task for the first time, 0 elsewhere",
+            "failed": failed,
+            "digest": digest(demonstrations),
+            "settings": json.dumps(settings),
+            "versions": json.dumps({library: version(library) for library in LIBRARIES}),
+        }
+        with room_for(path, _bytes_on_disk(successes)):
+            self.root.mkdir(parents=True, exist_ok=True)
+            writing = Path(tempfile.mkdtemp(prefix=".writing-", dir=self.root))
+            writing.chmod(0o755)
+            try:
+                _write(writing, successes, metadata)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                writing.replace(path)
+                sync(path.parent)
+            except OSError as error:
+                if error.errno not in {errno.ENOTEMPTY, errno.EEXIST} or not (there := self.load(dataset_id, task)):
+                    raise
+                return there
+            finally:
+                shutil.rmtree(writing, ignore_errors=True)
+        self._copy(dataset_id)
+        return TaskDemonstrations(dataset_id, demonstrations, failed, metadata["digest"])
+
+    def _fetched(self, dataset_id: str) -> bool:
+        """Fetch a data set from the storage, if it is there, and return whether it was."""
+        if self._storage is None:
+            return False
+        try:
+            return self._storage.get_sealed(f"data/{dataset_id}", self.root / dataset_id, FILES, DIGESTS)
+        except Exception as error:  # noqa: BLE001  whatever a storage raises, demonstrations can be made again
+            console.print(f"warning: {self._storage.url} gives no {dataset_id}: {error}", markup=False)
+            return False
+
+    def _copy(self, dataset_id: str) -> None:
+        """Copy a new data set to the storage."""
+        if self._storage is None:
+            return
+        contents = {file: (self.root / dataset_id / file).read_bytes() for file in (*FILES, DIGESTS)}
+        try:
+            self._storage.put_sealed(f"data/{dataset_id}", contents, DIGESTS)
+        except Exception as error:  # noqa: BLE001  whatever a storage raises, they are here
+            console.print(f"warning: {self._storage.url} does not take {dataset_id}: {error}", markup=False)
+
+
+def open_store() -> DemoStore:
+    """Return the store under the data root, with the storage that ``DMIL_STORAGE`` names behind it.
+
+    Raises:
+        StorageError: if it names none.
+    """
+    return DemoStore(data_root(), given_storage())
+
+
+def _write(folder: Path, successes: Sequence[Attempt], metadata: dict[str, Any]) -> None:
+    """Write a Minari data set and the digests of its files."""
+    storage = MinariStorage.new(
+        folder / "data",
+        observation_space=_box(successes[0].observations),
+        action_space=gymnasium.spaces.Box(-1, 1, successes[0].actions.shape[1:], np.float32),
+    )
+    storage.update_metadata(metadata)
+    storage.update_episodes([_episode(attempt) for attempt in successes])
+    write_listing(folder, DIGESTS, (ARRAYS, METADATA))
+    for name in (ARRAYS, METADATA, "data", "."):
+        sync(folder / name)
+
+
+def _bytes_on_disk(successes: Sequence[Attempt]) -> int:
+    """Return about what a data set takes: rewards and ends of episodes are 10 bytes a step."""
+    states = sum(attempt.observations.nbytes + attempt.actions.nbytes for attempt in successes)
+    steps = sum(len(attempt.actions) for attempt in successes)
+    return states + 10 * steps + 2**13 * len(successes) + 2**16
+
+
+def _read_episodes(path: Path, number: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the observations and the actions of each episode, one observation more than actions.
+
+    Raises:
+        ValueError: names what is not as it was written, before any array is read.
+    """
+    with h5py.File(path) as file:
+        found = [_find_episode(file, f"episode_{index}", index) for index in range(number)]
+        size = sum(array.nbytes for arrays in found for array in arrays)
+        if size > path.stat().st_size:  # as where they are compressed, or one array has several names
+            raise ValueError(f"got arrays of {size} bytes in a file of {path.stat().st_size}; wanted them all in it")
+        return [(observations[()], actions[()]) for observations, actions in found]
+
+
+def _find_episode(file: h5py.File, name: str, index: int) -> tuple[h5py.Dataset, h5py.Dataset]:
+    if (found := file[name].attrs["id"]) != index:
+        raise ValueError(f"{name}: got the id {found}; wanted {index}, as no other has")
+    observations, actions = _find_array(file, f"{name}/observations"), _find_array(file, f"{name}/actions")
+    if len(observations) != len(actions) + 1:
+        raise ValueError(f"{name}: got {len(observations)} observations of {len(actions)} actions; wanted one more")
+    return observations, actions
+
+
+def _find_array(file: h5py.File, name: str) -> h5py.Dataset:
+    array = file[name]
+    if not isinstance(array, h5py.Dataset) or array.file != file or array.is_virtual or array.external:
+        raise ValueError(f"{name}: got no array of this file; wanted one")
+    if array.dtype != np.float32 or array.ndim != 2:
+        raise ValueError(f"{name}: got {array.dtype} of the shape {array.shape}; wanted float32, (steps, dimensions)")
+    return array
+
+
+def _box(observations: np.ndarray) -> gymnasium.spaces.Box:
+    return gymnasium.spaces.Box(-np.inf, np.inf, observations.shape[1:], np.float32)
+
+
+def _episode(attempt: Attempt) -> EpisodeBuffer:
+    steps = len(attempt.actions)
+    return EpisodeBuffer(
+        seed=attempt.seed,
+        options={"goal": attempt.goal} if attempt.goal else None,
+        observations=attempt.observations,  # type: ignore[arg-type]
+        actions=attempt.actions,  # type: ignore[arg-type]
+        rewards=[float(step == attempt.solved_at) for step in range(steps)],
+        terminations=[False] * steps,
+        truncations=[False] * (steps - 1) + [True],
+    )

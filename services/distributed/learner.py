@@ -1,0 +1,55 @@
+"""The actor that takes the outer step: the only one with state."""
+
+import math
+import time
+from typing import NamedTuple
+
+import torch
+
+from dmil_core.configs import TrainingConfig
+from dmil_core.outer_loop import OuterState, OuterStep
+from services.distributed.chunking import Freight, pack, unpack
+from services.distributed.timing import Span
+
+__all__ = ["Learner", "StepReport"]
+
+
+class StepReport(NamedTuple):
+    """What is told of an outer step beside the new parameters."""
+
+    gradient_norm: float
+    """Before clipping; where it is not finite, the step was not taken."""
+    span: Span
+
+
+class Learner:
+    """Holds the parameters and what else its steps depend on."""
+
+    def __init__(self, state: OuterState, training: TrainingConfig, *, skip_nonfinite: bool = False) -> None:
+        """Continue from `state`.
+
+        Args:
+            state: where to go on.
+            training: settings of the outer loop.
+            skip_nonfinite: whether an iteration without a step, for its gradient was not finite, counts as done.
+        """
+        torch.set_num_threads(1)
+        self._skip = skip_nonfinite
+        self._step = OuterStep(state, training)
+
+    def parameters(self) -> tuple[float, Freight]:
+        """Return the time on this machine's clock, and the current parameters, flat."""
+        return time.perf_counter(), pack(self._step.parameters.numpy().copy())
+
+    def step(self, gradient: Freight) -> tuple[StepReport, Freight]:
+        """Step by the sum of all gradients; return the report and the new parameters."""
+        began = time.perf_counter()
+        norm = self._step(unpack(gradient))
+        if self._skip and not math.isfinite(norm):
+            self._step.skip()
+        ended, parameters = self.parameters()
+        return StepReport(norm, Span(began, ended)), parameters
+
+    def state(self) -> OuterState:
+        """Return everything a checkpoint needs."""
+        return self._step.state

@@ -1,0 +1,164 @@
+"""What a run tells Ray of itself, so that Ray's dashboard and Prometheus show it: names, kinds, labels, and who counts.
+
+Ray puts ``ray_`` before each name, and ``_total`` behind that of a counter; docs/operations.md lists them.
+"""
+
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from services.cli.live_view import Workers
+from services.distributed.pool_events import Witness
+from services.distributed.timing import Timing
+
+if TYPE_CHECKING:
+    from services.distributed.calls import Call
+
+__all__ = ["MEASURES", "Crew", "Measure", "Meter", "RayMeter"]
+
+
+class Measure(NamedTuple):
+    """Something that is counted or measured."""
+
+    name: str
+    kind: Literal["counter", "gauge", "histogram"]
+    meaning: str
+    labels: tuple[str, ...] = ()
+    """Besides the suite, which all have."""
+
+
+ITERATIONS = Measure("dmil_iterations", "counter", "Iterations of meta-training done.")
+ITERATION_SECONDS = Measure("dmil_iteration_seconds", "histogram", "Time from one outer step's end to the next one's.")
+PHASE_SECONDS = Measure(
+    "dmil_phase_seconds",
+    "counter",
+    "Seconds of iterations by phase: broadcast, compute, waiting, reduction, step; they add up to the iterations'.",
+    ("phase",),
+)
+SLOTS_REDONE = Measure(
+    "dmil_slots_redone",
+    "counter",
+    "Slots given to another worker, whose own ended or was slow, or done again with iterations that a learner lost.",
+)
+WORKERS = Measure("dmil_workers", "gauge", "Workers that are up.", ("kind",))
+WORKERS_JOINED = Measure("dmil_workers_joined", "counter", "Workers that came up, the first ones included.", ("kind",))
+WORKERS_LOST = Measure("dmil_workers_lost", "counter", "Workers that died or were ended for slowness.", ("kind",))
+EPISODES = Measure("dmil_episodes", "counter", "Episodes of evaluations.", ("split", "shots"))
+SUCCESSES = Measure("dmil_successes", "counter", "Episodes that were successes.", ("split", "shots"))
+SUCCESS_RATE = Measure(
+    "dmil_success_rate", "gauge", "Success rate of the evaluation that came to its end last.", ("split", "shots")
+)
+SPOOL_RECORDS = Measure("dmil_spool_records", "gauge", "Records that wait for MLflow on disk.")
+CHECKPOINT_TIME = Measure(
+    "dmil_checkpoint_timestamp_seconds",
+    "gauge",
+    "When the newest checkpoint was written, in seconds since 1970; before the first, when meta-training began.",
+)
+MEASURES = (
+    ITERATIONS, ITERATION_SECONDS, PHASE_SECONDS, SLOTS_REDONE, WORKERS, WORKERS_JOINED, WORKERS_LOST, EPISODES,
+    SUCCESSES, SUCCESS_RATE, SPOOL_RECORDS, CHECKPOINT_TIME,
+)  # fmt: skip
+
+BOUNDS = [0.001 * 2**power for power in range(18)]
+"""Of the histogram's buckets, in seconds: a millisecond to some two minutes."""
+NOTHING = 1e-300
+"""Ray's counters refuse 0; this is lost in whatever is added to it."""
+
+
+class Meter:
+    """Takes what is counted and measured. Here nobody looks at it: where there is no Ray, it costs nothing."""
+
+    def record(self, measure: Measure, value: float = 1.0, **labels: str) -> None:
+        """Add to a counter, set a gauge, or observe a value of a histogram."""
+
+    def iteration(self, timing: Timing) -> None:
+        """Count an iteration, and where its time went."""
+
+
+class RayMeter(Meter):
+    """Tells Ray's metrics: a number in memory each, which Ray collects every few seconds."""
+
+    def __init__(self, suite: str) -> None:
+        """Begin all counters that go without further labels.
+
+        Args:
+            suite: the label that all of this process have.
+        """
+        self._metrics = {measure: _of_ray(measure, suite) for measure in MEASURES}
+        for measure in MEASURES:
+            if measure.kind == "counter" and not measure.labels:
+                self.record(measure, 0.0)
+
+    def record(self, measure: Measure, value: float = 1.0, **labels: str) -> None:
+        """Add to a counter, set a gauge, or observe a value of a histogram.
+
+        A counter that 0 or less is added to is there from then on, and stays as it is: an alert on its growth needs
+        to see it before it grows.
+        """
+        metric = self._metrics[measure]
+        if measure.kind == "counter":
+            metric.inc(value if value > 0 else NOTHING, labels)
+        elif measure.kind == "gauge":
+            metric.set(value, labels)
+        else:
+            metric.observe(value, labels)
+
+    def iteration(self, timing: Timing) -> None:
+        """Count an iteration, and where its time went."""
+        self.record(ITERATIONS)
+        self.record(ITERATION_SECONDS, timing.iteration)
+        for phase, seconds in timing._asdict().items():
+            self.record(PHASE_SECONDS, seconds, phase=phase)
+
+
+def _of_ray(measure: Measure, suite: str) -> Any:
+    from ray.util.metrics import Counter, Gauge, Histogram
+
+    labels = ("suite", *measure.labels)
+    if measure.kind == "histogram":
+        metric = Histogram(measure.name, measure.meaning, BOUNDS, labels)
+    else:
+        metric = {"counter": Counter, "gauge": Gauge}[measure.kind](measure.name, measure.meaning, labels)
+    return metric.set_default_tags({"suite": suite})
+
+
+class Crew(Witness):
+    """Counts the workers of one kind, in one pool or several, and the slots that they are given again."""
+
+    def __init__(self, kind: str, meter: Meter) -> None:
+        """Begin with none."""
+        self._kind, self._meter = kind, meter
+        self._alive = self._lost = 0
+        for measure in (WORKERS_JOINED, WORKERS_LOST, WORKERS):
+            meter.record(measure, 0.0, kind=kind)
+
+    @property
+    def workers(self) -> Workers:
+        """How many there are, and how many were replaced."""
+        return Workers(self._kind, self._alive, self._lost)
+
+    def joined(self) -> None:
+        """Count a worker that came up."""
+        self._meter.record(WORKERS_JOINED, kind=self._kind)
+        self._count(1)
+
+    def lost(self) -> None:
+        """Count a worker that died or was ended for slowness."""
+        self._lost += 1
+        self._meter.record(WORKERS_LOST, kind=self._kind)
+        self._count(-1)
+
+    def left(self) -> None:
+        """Count off a worker whose work is over."""
+        self._count(-1)
+
+    def again(self, call: "Call") -> None:
+        """Count the slots of a gradient that another worker is asked for."""
+        if call.method == "gradient":
+            self.redone(sum(map(len, call.arguments[3])))
+
+    def redone(self, slots: int) -> None:
+        """Count slots that are done again."""
+        self._meter.record(SLOTS_REDONE, float(slots))
+
+    def _count(self, more: int) -> None:
+        self._alive += more
+        self._meter.record(WORKERS, float(self._alive), kind=self._kind)

@@ -1,0 +1,266 @@
+"""Evaluations of checkpoints: who is tried out on what, the rows that come of it, and those made on the way."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from dmil_core.configs import ExperimentConfig
+from dmil_core.demonstrations import Demonstration
+from dmil_core.methods.base import Standardised
+from dmil_core.methods.registry import method_type
+from dmil_core.settings import sub_skills_of
+from services.cli.live_view import Tally
+from services.cli.progress import console
+from services.demonstrations.store import TaskDemonstrations
+from services.distributed.failures import keeping_failures
+from services.distributed.metrics import EPISODES, SUCCESS_RATE, SUCCESSES, Meter
+from services.distributed.runner import Runner, Simulation
+from services.evaluation.results import AdaptationResult, EpisodeResult, ImitationResult, Split, write_rows
+from services.evaluation.summary import Evaluation, cells, rates, sub_skill_use
+from services.rollouts.trials import Imitation, Trial, TrialOutcome, trials
+from services.storage.checkpoints import Checkpoint, Checkpoints
+from services.storage.provenance import library_versions
+from services.suites.base import TaskSuite
+from services.tracking import Tracker
+
+__all__ = ["Evaluations", "Evaluator", "Tallies", "write_evaluation"]
+
+
+class Tallies:
+    """Counts the episodes of an evaluation as they come, by split and size of support set."""
+
+    def __init__(self, meter: Meter) -> None:
+        """Count none yet."""
+        self._meter = meter
+        self._counts: dict[tuple[Split, int], tuple[int, int]] = {}
+
+    def __iter__(self) -> Iterator[Tally]:
+        """Go through the counts so far, those of meta-training tasks first."""
+        found = [Tally(*where, *counts) for where, counts in list(self._counts.items())]
+        return iter(sorted(found, key=lambda tally: (tally.split == "meta-testing", tally.shots)))
+
+    def add(self, trial: Trial, outcome: TrialOutcome) -> None:
+        """Count a trial's episodes."""
+        successes, episodes = sum(episode.success for episode in outcome.episodes), len(outcome.episodes)
+        before = self._counts.get((trial.split, trial.shots), (0, 0))
+        self._counts[trial.split, trial.shots] = before[0] + successes, before[1] + episodes
+        self._meter.record(EPISODES, float(episodes), split=trial.split, shots=str(trial.shots))
+        self._meter.record(SUCCESSES, float(successes), split=trial.split, shots=str(trial.shots))
+
+    def finish(self) -> None:
+        """Tell the success rates, now that all episodes are counted."""
+        for tally in self:
+            rate = tally.successes / tally.episodes
+            self._meter.record(SUCCESS_RATE, rate, split=tally.split, shots=str(tally.shots))
+
+
+class Evaluator:
+    """What all evaluations of an experiment share; its checkpoints come one by one."""
+
+    def __init__(
+        self,
+        runner: Runner,
+        config: ExperimentConfig,
+        suite: TaskSuite,
+        tasks: Sequence[tuple[Split, str]],
+        data: Mapping[str, TaskDemonstrations],
+        held_out: Mapping[str, Sequence[Demonstration]],
+    ) -> None:
+        """Share the support demonstrations with the runner's workers.
+
+        Args:
+            runner: does the work.
+            config: of the experiment.
+            suite: of the experiment.
+            tasks: all tasks with their split.
+            data: every task's demonstrations.
+            held_out: of each task, those that support sets are drawn from.
+        """
+        self._runner, self.config, self._suite, self._data, self._held_out = runner, config, suite, data, held_out
+        self.trials = trials(tasks, config.evaluation)
+        self._shared = {task: runner.share(demonstrations) for task, demonstrations in held_out.items()}
+
+    def is_due(self, iteration: int) -> bool:
+        """Tell whether a checkpoint is evaluated on the way."""
+        every = self.config.evaluation.every
+        return every is not None and 0 < iteration < self.config.training.iterations and iteration % every == 0
+
+    def calls(self, checkpoint: Checkpoint) -> list[tuple[Any, ...]]:
+        """Return the arguments of `SimulationWorker.try_out`, and of its `imitate`, for each trial.
+
+        The checkpoint is not read again.
+        """
+        method = self._method(checkpoint)
+        shapes = {name: torch.Size(shape) for name, shape in checkpoint.manifest.shapes.items()}
+        parameters = self._runner.share(checkpoint.state.parameters)
+        config = self.config
+        return [
+            (method, parameters, shapes, trial, self._shared[trial.task], config.evaluation, config.seed)
+            for trial in self.trials
+        ]
+
+    def evaluation(self, checkpoint: Checkpoint, outcomes: Iterable[TrialOutcome]) -> Evaluation:
+        """Return a row for each episode and each adaptation, from the outcomes of the trials in their order."""
+        episodes, adaptations = [], []
+        for trial, outcome in zip(self.trials, outcomes, strict=True):
+            row = self._row(checkpoint, trial)
+            episodes += _episode_rows(row, trial, outcome)
+            adaptations.append(_adaptation_row(row, outcome, sub_skills_of(self.config.method)))
+        failed = {task: dataset.failed for task, dataset in self._data.items()}
+        held = {task: len(dataset.demonstrations) for task, dataset in self._data.items()}
+        suite = self._suite
+        return Evaluation(checkpoint, suite.protocol, suite.best_score, failed, held, episodes, adaptations)
+
+    def imitation(self, checkpoint: Checkpoint, outcomes: Iterable[Imitation]) -> list[ImitationResult]:
+        """Return a row for each trial, from what `SimulationWorker.imitate` found in them in their order."""
+        return [
+            ImitationResult.model_validate(
+                {
+                    **self._row(checkpoint, trial),
+                    "support_error": _finite(outcome.support),
+                    "held_out_error": _finite(outcome.held_out),
+                }
+            )
+            for trial, outcome in zip(self.trials, outcomes, strict=True)
+        ]
+
+    def _row(self, checkpoint: Checkpoint, trial: Trial) -> dict[str, object]:
+        """Return what names a trial in all of its rows."""
+        settings = self.config.evaluation
+        return {
+            "suite": self._suite.name,
+            "protocol": self._suite.protocol,
+            "method": self.config.method.name,
+            "checkpoint": checkpoint.digest,
+            "versions": library_versions(),
+            "fine_tuning_steps": settings.fine_tuning_steps,
+            "learning_rate": settings.learning_rate,
+            "split": trial.split,
+            "task": trial.task,
+            "shots": trial.shots,
+            "draw": trial.draw,
+            "support": [demonstration.id for demonstration in trial.support(self._held_out[trial.task])],
+            "data": self._data[trial.task].digest,
+        }
+
+    def _method(self, checkpoint: Checkpoint) -> Standardised[Any]:
+        settings = self.config.method
+        return method_type(settings.name).restored(settings, self._suite.action_dim, checkpoint.constants)
+
+
+class Evaluations:
+    """The evaluations on the way of meta-training: beside it, or in pauses of it; the rows are the same.
+
+    Beside it, one is under way at a time; where the next begins before its end, meta-training waits for it.
+    """
+
+    def __init__(
+        self, runner: Runner, evaluator: Evaluator, checkpoints: Checkpoints, tracker: Tracker, *, overlap: bool
+    ) -> None:
+        """Evaluate nothing yet.
+
+        Args:
+            runner: does the work.
+            evaluator: of the experiment.
+            checkpoints: of the run; those that wait for their evaluation are not let go. The folder ``evaluations``
+                beside theirs gets a folder for each evaluation, named by the iteration.
+            tracker: takes the success rates.
+            overlap: evaluate beside meta-training.
+        """
+        self._runner, self._evaluator, self._checkpoints, self._tracker = runner, evaluator, checkpoints, tracker
+        self._folder = checkpoints.folder.with_name("evaluations")
+        self._overlap = overlap
+        checkpoints.spares = lambda iteration: self.is_due(iteration) and not self._is_made(iteration)
+        self._under_way: tuple[Checkpoint, Simulation] | None = None
+        self.found: dict[str, Any] = {}
+        """What the last one found, as `Figures` have it: the ``success``, and ``after`` how many iterations."""
+
+    def is_due(self, iteration: int) -> bool:
+        """Tell whether the checkpoint of an iteration is evaluated on the way; the last one is when all is over."""
+        return self._evaluator.is_due(iteration)
+
+    def _is_made(self, iteration: int) -> bool:
+        return (self._folder / f"{iteration:07d}" / "episodes.jsonl").exists()
+
+    def make_up(self) -> None:
+        """Evaluate the checkpoints whose evaluation was due and dropped when the run was stopped."""
+        for path in self._checkpoints.all():
+            iteration = int(path.name.partition("-")[2])
+            if self.is_due(iteration) and not self._is_made(iteration):
+                self.begin(Checkpoint(path))
+
+    def begin(self, checkpoint: Checkpoint) -> None:
+        """Evaluate a checkpoint."""
+        self.finish()
+        calls = self._evaluator.calls(checkpoint)
+        with self._keeping_failures(checkpoint):
+            if self._overlap:
+                self._under_way = checkpoint, self._runner.simulate_beside("try_out", calls)
+            else:
+                outcomes = dict(self._runner.simulate("try_out", calls))
+                self._record(checkpoint, [outcomes[index] for index in range(len(calls))])
+
+    def _keeping_failures(self, checkpoint: Checkpoint) -> AbstractContextManager[None]:
+        return keeping_failures(self._folder.parent, self._evaluator.config, lambda: checkpoint.path)
+
+    def look(self) -> None:
+        """Record the evaluation under way, if it has come to its end."""
+        if self._under_way is not None and self._under_way[1].done():
+            self.finish()
+
+    def finish(self) -> None:
+        """Wait for the evaluation under way, if there is one."""
+        if self._under_way is not None:
+            checkpoint, simulation = self._under_way
+            with self._keeping_failures(checkpoint):
+                self._record(checkpoint, simulation.results())
+            self._under_way = None
+
+    def _record(self, checkpoint: Checkpoint, outcomes: Sequence[TrialOutcome]) -> None:
+        iteration = checkpoint.manifest.iteration
+        evaluation = self._evaluator.evaluation(checkpoint, outcomes)
+        write_evaluation(evaluation, self._folder / f"{iteration:07d}")
+        tallies = Tallies(self._runner.meter)
+        for trial, outcome in zip(self._evaluator.trials, outcomes, strict=True):
+            tallies.add(trial, outcome)
+        tallies.finish()
+        self.found = {"success": list(tallies), "after": iteration}
+        found = cells(evaluation.episodes, evaluation.best_score, self._evaluator.config.method)
+        self._tracker.metrics(iteration, rates(found, sub_skill_use(evaluation.adaptations)))
+        in_words = "; ".join(f"{cell.split} {cell.shots}-shot {cell.success_rate:.3f}" for cell in found)
+        console.note(f"success rates after {iteration} iterations: {in_words}")
+
+
+def write_evaluation(evaluation: Evaluation, folder: Path) -> None:
+    """Write an evaluation's rows to ``adaptations.jsonl`` and ``episodes.jsonl``, in place of those there were.
+
+    Each is written whole, the episodes last: where they are, the evaluation is complete.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    write_rows(folder / "adaptations.jsonl", evaluation.adaptations)
+    write_rows(folder / "episodes.jsonl", evaluation.episodes)
+
+
+def _finite(error: float | None) -> float | None:
+    return error if error is not None and np.isfinite(error) else None
+
+
+def _episode_rows(row: Mapping[str, object], trial: Trial, outcome: TrialOutcome) -> list[EpisodeResult]:
+    return [
+        EpisodeResult.model_validate({**row, "episode": number, **episode.outcome})
+        for number, episode in zip(trial.episodes, outcome.episodes, strict=True)
+    ]
+
+
+def _adaptation_row(row: Mapping[str, object], outcome: TrialOutcome, sub_skills: int) -> AdaptationResult:
+    none = np.zeros(0, np.int64)  # where the support set is all that is held out
+    chosen = np.concatenate([none, *(use.chosen for use in outcome.use)])
+    best = np.concatenate([none, *(use.best for use in outcome.use)])
+    counts = np.bincount(chosen, minlength=sub_skills)
+    return AdaptationResult.model_validate(
+        {**row, "steps": len(chosen), "agreeing": int((chosen == best).sum()), "sub_skill_steps": counts.tolist()}
+    )

@@ -1,0 +1,74 @@
+"""The paper's figures, from ``paper_results.json``: what its appendix prints, as data."""
+
+import json
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+from pydantic import BaseModel
+
+from dmil_core.dmil_config import DmilConfig
+from dmil_core.settings import MethodConfig
+from services.evaluation.results import Split
+
+__all__ = ["Published", "figure", "figure_of"]
+
+BENCHMARKS = {"ml10": "ML10", "ml45": "ML45"}
+KITCHENS = ("kitchen-topburner", "kitchen-microwave", "kitchen-kettle", "kitchen-slide")
+"""The rows of Table 5; of the last two, which hold the same sub-tasks, the paper does not say which is which."""
+
+
+ROWS = {"option-gail": "OptionGAIL"}
+"""Of Table 4, by method."""
+VARIANTS = {"both": "DMIL", "high": "DMIL-High", "low": "DMIL-Low"}
+"""Rows of Table 4, by the levels that DMIL adapts."""
+
+
+class Published(BaseModel):
+    """A figure of the paper, with its spread as printed, if one is."""
+
+    value: float
+    spread: float | None
+    table: str
+
+    def in_words(self, digits: int) -> str:
+        """Return it to so many digits."""
+        spread = "" if self.spread is None else f" ± {self.spread:.{digits}f}"
+        return f"{self.value:.{digits}f}{spread}"
+
+
+@cache
+def _tables() -> dict[str, Any]:
+    return json.loads((files("services.evaluation") / "paper_results.json").read_text("utf-8"))
+
+
+def figure(table: str, row: str, suite: str, split: Split, shots: int) -> Published | None:
+    """Return the paper's figure, if it has one: a success rate (Tables 4, 6, 7, 8), or a score (Table 5).
+
+    Args:
+        table: as table4.
+        row: as the paper names it: a method or a variant, K=4, or a number of fine-tuning steps.
+        suite: as ml10 or kitchen-kettle.
+        split: of its tasks.
+        shots: demonstrations adapted to; Table 5 does not tell how many: its figures stand beside all.
+    """
+    found, title = _tables()[table]["rows"], f"Table {table.removeprefix('table')}"
+    if table == "table5":
+        if suite not in KITCHENS or split != "meta-testing" or row not in found[KITCHENS.index(suite)]:
+            return None
+        value, spread = found[KITCHENS.index(suite)][row]
+        return Published(value=value, spread=spread, table=title)
+    key, figures = f"{BENCHMARKS.get(suite)}/{split}/{shots}-shot", found.get(row, {})
+    means = figures.get("mean", figures)
+    if key not in means:
+        return None
+    return Published(value=means[key], spread=figures.get("spread", {}).get(key), table=title)
+
+
+def figure_of(method: MethodConfig, suite: str, split: Split, shots: int) -> Published | None:
+    """Return the paper's figure for a method: success rates (Table 4, K = 3), or DMIL's scores (Table 5)."""
+    if not isinstance(method, DmilConfig):
+        return figure("table4", ROWS.get(method.name, ""), suite, split, shots)
+    if suite in KITCHENS:
+        return figure("table5", f"K={method.sub_skills}", suite, split, shots)
+    return figure("table4", VARIANTS[method.adapted], suite, split, shots)

@@ -1,0 +1,157 @@
+"""Rows of results: one an episode, one an adaptation, with all that is needed to run them again."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from dmil_core.errors import UserError, explain
+from services.storage.files import read_file, write_file
+
+__all__ = [
+    "AdaptationResult",
+    "EpisodeResult",
+    "EvaluationFolder",
+    "ImitationResult",
+    "RowError",
+    "Split",
+    "read_lines",
+    "read_rows",
+    "write_rows",
+]
+
+Split = Literal["meta-training", "meta-testing"]
+Row = TypeVar("Row", bound=BaseModel)
+MOST_BYTES = 2**30
+"""In a file of rows."""
+LONGEST_LINE = 2**20
+
+
+class RowError(UserError):
+    """A line that is no whole row."""
+
+
+class _Row(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    suite: str
+    protocol: str
+    method: str
+    checkpoint: str
+    """The checkpoint's digest, which covers all but its loss and the id of the MLflow run."""
+    split: Split
+    task: str
+    shots: int
+    draw: int
+    """Which of the disjoint support sets was adapted to."""
+    support: tuple[str, ...]
+    """Ids of the support demonstrations."""
+    data: str
+    """SHA-256 of the task's demonstrations."""
+    fine_tuning_steps: int
+    learning_rate: float
+    versions: dict[str, str]
+
+
+class EpisodeResult(_Row):
+    """One episode of an adapted policy."""
+
+    episode: int
+    seed: int
+    """Of the environment."""
+    goal: tuple[float, ...]
+    """What the environment drew from the seed."""
+    success: bool
+    score: int
+    """Sub-tasks done in suites that count them, else 1 for a success."""
+    steps: int
+    sub_skill_steps: tuple[int, ...]
+    """How many steps each sub-skill acted."""
+
+
+class AdaptationResult(_Row):
+    """How an adapted policy uses its sub-skills on held-out demonstrations of the task."""
+
+    steps: int
+    """Demonstrated steps looked at."""
+    agreeing: int
+    """Of these, where the high level takes the sub-skill that fits the demonstrated action best."""
+    sub_skill_steps: tuple[int, ...]
+    """Of these, how many each sub-skill takes."""
+
+
+class ImitationResult(_Row):
+    """How far an adapted policy's actions are from those demonstrated: mean ‖π(s) − a‖² over steps.
+
+    A policy that has diverged has no error.
+    """
+
+    support_error: float | None
+    """On the demonstrations that it was adapted to."""
+    held_out_error: float | None
+    """On held-out ones that it was not adapted to, where there are any."""
+
+
+def write_rows(path: Path, rows: Iterable[BaseModel]) -> None:
+    """Write a file of JSON lines, whole, in place of the one there was.
+
+    Raises:
+        DiskFullError: for want of space; the file is then what it was.
+    """
+    write_file(path, "".join(row.model_dump_json() + "\n" for row in rows))
+
+
+def read_rows(path: Path, model: type[Row]) -> list[Row]:
+    """Read the rows of a file of JSON lines.
+
+    Raises:
+        RowError: names the file and the line that is not a row as `write_rows` writes it.
+    """
+    rows = []
+    for number, line in read_lines(path):
+        try:
+            rows.append(model.model_validate_json(line, strict=True))
+        except ValidationError as error:
+            got = "; ".join(explain(error, "row").splitlines())
+            raise RowError(f"{path}:{number}: {got}; wanted a whole {model.__name__}; make the file again") from error
+    return rows
+
+
+def read_lines(path: Path) -> Iterator[tuple[int, bytes]]:
+    """Yield the lines of a file with their numbers from 1.
+
+    Raises:
+        RowError: if there is no such file, it is too large or a line too long, or its last line has no end: whoever
+            wrote it was killed.
+    """
+    try:
+        lines = read_file(path, MOST_BYTES).split(b"\n")
+    except OSError as error:
+        raise RowError(f"{path}: got {error.strerror}; wanted a file of JSON lines; make it again") from error
+    for number, line in enumerate(lines, start=1):
+        if len(line) > LONGEST_LINE:
+            raise RowError(f"{path}:{number}: got a line of {len(line)} bytes; wanted at most {LONGEST_LINE}")
+        if number < len(lines):
+            yield number, line
+        elif line:
+            raise RowError(f"{path}:{number}: got half a line; wanted a whole one; remove it or make the file again")
+
+
+@dataclass(frozen=True)
+class EvaluationFolder:
+    """A folder with the rows of an evaluation; each file is read when it is asked for, once."""
+
+    folder: Path
+
+    @cached_property
+    def episodes(self) -> list[EpisodeResult]:
+        """A row an episode."""
+        return read_rows(self.folder / "episodes.jsonl", EpisodeResult)
+
+    @cached_property
+    def adaptations(self) -> list[AdaptationResult]:
+        """A row an adaptation."""
+        return read_rows(self.folder / "adaptations.jsonl", AdaptationResult)

@@ -1,0 +1,305 @@
+"""From result rows to the table that a run ends with."""
+
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+from operator import attrgetter
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import BaseModel
+from rich.table import Table
+
+from dmil_core.settings import MethodConfig
+from dmil_core.statistics import Rate, mean_score, share_entropy, success_rate
+from services.evaluation.paper_results import Published, figure_of
+from services.evaluation.results import AdaptationResult, EpisodeResult, Split
+from services.storage.checkpoints import Checkpoint
+
+__all__ = [
+    "AGAINST_COLLAPSE",
+    "COLLAPSED",
+    "Cell",
+    "Evaluation",
+    "Score",
+    "SubSkillUse",
+    "Summary",
+    "cells",
+    "described",
+    "headline",
+    "rates",
+    "sub_skill_use",
+    "summarise",
+    "table",
+    "table_markdown",
+    "write_summary",
+]
+
+BEST = 5
+"""So many of a task's episodes count in the authors' own figure for the kitchen."""
+COLLAPSED = 0.99
+"""A sub-skill with more of the states than this leaves nothing to the others."""
+AGAINST_COLLAPSE = (
+    "another --seed, a smaller --training.learning-rate or --method.output-scale may help, and "
+    "--method.continuity-weight 0"
+)
+
+
+class Evaluation(NamedTuple):
+    """What an evaluation found, and of what."""
+
+    checkpoint: Checkpoint
+    protocol: str
+    best_score: int
+    """Of an episode in which all is done, see `TaskSuite`."""
+    failed_attempts: dict[str, int]
+    demonstrations: dict[str, int]
+    """Of each task."""
+    episodes: list[EpisodeResult]
+    adaptations: list[AdaptationResult]
+
+
+class Score(BaseModel):
+    """Sub-tasks done in an episode."""
+
+    best: int
+    """Of an episode in which all are done."""
+    mean: float
+    deviation: float | None
+    """Standard deviation over episodes; a single one has none, and no interval."""
+    low: float | None
+    high: float | None
+    mean_of_best: float
+    """The mean of the five best episodes of each task, which the authors' script prints."""
+    per_task: dict[str, float]
+
+
+class Cell(BaseModel):
+    """The success rate of one split and size of support set."""
+
+    suite: str
+    split: Split
+    shots: int
+    episodes: int
+    success_rate: float
+    low: float
+    high: float
+    per_task: dict[str, float]
+    score: Score | None
+    """In suites that count sub-tasks."""
+    paper: Published | None
+    """The paper's success rate for DMIL, or its score where there are scores."""
+
+
+class SubSkillUse(BaseModel):
+    """How the adapted policies of one split use their sub-skills on held-out demonstrations."""
+
+    share: list[float]
+    """Of all states, the part that each sub-skill takes."""
+    entropy: float
+    """Of these shares: 0 if one takes all, 1 if all take the same."""
+    in_use_per_task: float
+    """Sub-skills with over a tenth of a task's states, on average over adaptations."""
+    agreement: float
+    """Of all states, the part where the high level takes the sub-skill that fits the demonstrated action best."""
+
+
+class Summary(BaseModel):
+    """``summary.json``: what came of a run."""
+
+    method: str
+    environment_steps: int
+    """Steps that meta-training took in the environments of its tasks, for methods that practise there."""
+    rows: list[Cell]
+    seconds: dict[str, float]
+    sub_skills: dict[Split, SubSkillUse]
+    protocol: str
+    seed: int
+    checkpoint: str
+    checkpoint_digest: str
+    report: str
+    mlflow_run_id: str | None
+    failed_attempts: dict[str, int]
+    """Attempts of each task's expert that were no success and so no demonstration."""
+    demonstrations: dict[str, int] = {}
+    """Of each task, those held out among them; none is told in older files."""
+
+    @property
+    def collapsed(self) -> bool:
+        """Whether one of several sub-skills takes nearly all states."""
+        return any(len(use.share) > 1 and max(use.share) > COLLAPSED for use in self.sub_skills.values())
+
+
+def cells(episodes: Sequence[EpisodeResult], best_score: int, method: MethodConfig) -> list[Cell]:
+    """Return one cell for each split and size of support set, with Wilson intervals.
+
+    Args:
+        episodes: all rows.
+        best_score: of an episode in which all is done; where it is more than 1, scores are given too.
+        method: its settings, by which the paper's figures differ.
+    """
+    key = attrgetter("suite", "split", "shots")
+    found = []
+    for (suite, split, shots), group in groupby(sorted(episodes, key=key), key=key):
+        rows = list(group)
+        rate: Rate = success_rate([row.success for row in rows])
+        tasks = dict.fromkeys(row.task for row in rows)
+        per_task = {task: float(np.mean([row.success for row in rows if row.task == task])) for task in tasks}
+        found.append(
+            Cell(
+                suite=suite,
+                split=split,
+                shots=shots,
+                episodes=rate.episodes,
+                success_rate=rate.rate,
+                low=rate.low,
+                high=rate.high,
+                per_task=per_task,
+                score=_score(rows, best_score) if best_score > 1 else None,
+                paper=figure_of(method, suite, split, shots),
+            )
+        )
+    return sorted(found, key=lambda cell: (cell.suite, cell.split == "meta-testing", cell.shots))
+
+
+def _score(rows: Sequence[EpisodeResult], best: int) -> Score:
+    mean = mean_score([float(row.score) for row in rows])
+    by_task: dict[str, list[int]] = {}
+    for row in rows:
+        by_task.setdefault(row.task, []).append(row.score)
+    return Score(
+        best=best,
+        mean=mean.mean,
+        deviation=mean.deviation,
+        low=mean.low,
+        high=mean.high,
+        mean_of_best=float(np.mean([np.mean(sorted(scores)[-BEST:]) for scores in by_task.values()])),
+        per_task={task: float(np.mean(scores)) for task, scores in by_task.items()},
+    )
+
+
+def sub_skill_use(adaptations: Sequence[AdaptationResult]) -> dict[Split, SubSkillUse]:
+    """Return the use of sub-skills in each split, where there are several."""
+    use: dict[Split, SubSkillUse] = {}
+    for split in ("meta-training", "meta-testing"):
+        rows = [row for row in adaptations if row.split == split and row.steps]
+        if not rows or len(rows[0].sub_skill_steps) == 1:
+            continue
+        steps = np.array([row.sub_skill_steps for row in rows])
+        share = steps.sum(0) / steps.sum()
+        use[split] = SubSkillUse(
+            share=share.tolist(),
+            entropy=share_entropy(share),
+            in_use_per_task=float((steps / steps.sum(1, keepdims=True) > 0.1).sum(1).mean()),
+            agreement=sum(row.agreeing for row in rows) / sum(row.steps for row in rows),
+        )
+    return use
+
+
+def rates(rows: Sequence[Cell], use: Mapping[Split, SubSkillUse]) -> dict[str, float]:
+    """Return the metrics of an evaluation by the names they are tracked under: of each task, and in all."""
+    found: dict[str, float] = {}
+    for cell in rows:
+        name = f"{cell.split}/{cell.shots}-shot"
+        found |= {f"success_rate/{name}": cell.success_rate, f"success_rate_low/{name}": cell.low}
+        found |= {f"success_rate_high/{name}": cell.high, f"episodes/{name}": float(cell.episodes)}
+        found |= {f"task_success_rate/{name}/{task}": rate for task, rate in cell.per_task.items()}
+        if cell.score is not None:
+            found |= {f"score/{name}": cell.score.mean, f"score_best_{BEST}/{name}": cell.score.mean_of_best}
+            if cell.score.low is not None and cell.score.high is not None:
+                found |= {f"score_low/{name}": cell.score.low, f"score_high/{name}": cell.score.high}
+    for split, figures in use.items():
+        found |= {f"agreement/{split}": figures.agreement, f"sub_skill_entropy/{split}": figures.entropy}
+    return found
+
+
+def summarise(
+    evaluation: Evaluation, *, seconds: dict[str, float], folder: Path, mlflow_run_id: str | None = None
+) -> Summary:
+    """Return the summary of an evaluation whose report is to lie in `folder`."""
+    config = evaluation.checkpoint.manifest.config
+    return Summary(
+        method=config.method.name,
+        environment_steps=evaluation.checkpoint.manifest.environment_steps,
+        rows=cells(evaluation.episodes, evaluation.best_score, config.method),
+        seconds=seconds,
+        sub_skills=sub_skill_use(evaluation.adaptations),
+        protocol=evaluation.protocol,
+        seed=config.seed,
+        checkpoint=str(evaluation.checkpoint.path),
+        checkpoint_digest=evaluation.checkpoint.digest,
+        report=str(folder / "report"),
+        mlflow_run_id=mlflow_run_id,
+        failed_attempts=evaluation.failed_attempts,
+        demonstrations=evaluation.demonstrations,
+    )
+
+
+def table(summary: Summary) -> Table:
+    """Lay the summary out for the terminal."""
+    head, *rows = headline(summary)
+    view = Table(title=f"Success rates of {described(summary)}")
+    for column in head:
+        named = column in ("suite", "split")
+        view.add_column(column, justify="left" if named else "right", no_wrap=named)
+    for row in rows:
+        view.add_row(*row)
+    return view
+
+
+def table_markdown(summary: Summary) -> str:
+    """Lay the summary out as Markdown, with the success rate, and the score if there is one, of each task below."""
+    head, *rows = headline(summary)
+    lines = [_row(head), _row(["---"] * len(head)), *map(_row, rows)]
+    for split in dict.fromkeys(cell.split for cell in summary.rows):
+        cells = [cell for cell in summary.rows if cell.split == split]
+        lines += ["", _row(["task", *(f"{cell.shots}-shot" for cell in cells)]), _row(["---"] * (len(cells) + 1))]
+        lines += [_row([task, *(_of_task(cell, task) for cell in cells)]) for task in sorted(cells[0].per_task)]
+    return f"Success rates of {described(summary)}.\n\n" + "\n".join(lines) + "\n"
+
+
+def described(summary: Summary) -> str:
+    """Return of what a summary is: the method, the protocol, the seed, and its steps in environments."""
+    steps = f"; {summary.environment_steps:,} environment steps in meta-training" if summary.environment_steps else ""
+    return f"{summary.method} ({summary.protocol}; seed {summary.seed}{steps})"
+
+
+def headline(summary: Summary) -> list[list[str]]:
+    """Return the head and the rows of the table; columns that no row has anything in are left out."""
+    columns = ["suite", "split", "shots", "successes", "success rate", "95% interval"]
+    rows = [_fields(cell) for cell in summary.rows]
+    best = max((cell.score.best for cell in summary.rows if cell.score), default=1)
+    tables = {cell.paper.table for cell in summary.rows if cell.paper}
+    columns += [f"score of {best}", "95% interval", f"best {BEST} a task", ", ".join(["paper", *sorted(tables)])]
+    kept = [index for index in range(len(columns)) if any(row[index] for row in rows)]
+    return [[fields[index] for index in kept] for fields in (columns, *rows)]
+
+
+def _fields(cell: Cell) -> list[str]:
+    successes = f"{round(cell.success_rate * cell.episodes)}/{cell.episodes}"
+    fields = [cell.suite, cell.split, str(cell.shots), successes, f"{cell.success_rate:.3f}"]
+    fields.append(f"{cell.low:.3f} to {cell.high:.3f}")
+    if (score := cell.score) is None:
+        fields += ["", "", ""]
+    elif score.low is None or score.high is None:
+        fields += [f"{score.mean:.2f}", "", f"{score.mean_of_best:.2f}"]
+    else:
+        fields += [f"{score.mean:.2f} ± {score.deviation:.2f}", f"{score.low:.2f} to {score.high:.2f}"]
+        fields.append(f"{score.mean_of_best:.2f}")
+    paper = cell.paper
+    digits = 3 if cell.score is None else 2
+    return [*fields, "" if paper is None else paper.in_words(digits)]
+
+
+def _of_task(cell: Cell, task: str) -> str:
+    score = "" if cell.score is None else f", score {cell.score.per_task[task]:.2f}"
+    return f"{cell.per_task[task]:.2f}{score}"
+
+
+def _row(fields: Sequence[str]) -> str:
+    return f"| {' | '.join(fields)} |"
+
+
+def write_summary(summary: Summary, path: Path) -> None:
+    """Write ``summary.json``."""
+    path.write_text(summary.model_dump_json(indent=1) + "\n")

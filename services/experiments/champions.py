@@ -1,0 +1,234 @@
+"""The champion of each suite: in MLflow's registry, the model under the suite's name that has the alias ``champion``.
+
+A model takes it over where it is better in meta-testing tasks outside the interval of the difference: both adapt to the
+same support sets and act in the same episodes, each with fine-tuning as it was made for.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dmil_core.errors import RunError, UserError
+from services.demonstrations.store import TaskDemonstrations
+from services.distributed.runner import Runner
+from services.evaluation.comparison import Comparison, Contender, Difference, Unpaired
+from services.evaluation.summary import Evaluation
+from services.experiments.experiment import Experiment
+from services.storage.checkpoints import Checkpoint
+from services.suites.registry import open_suite
+from services.tracking import in_words, redacted, tracking_uri
+from services.tracking.delivery import IDENTITY, Identity
+from services.tracking.models import CHECKPOINT_TAG, checkpoint_in, models_of
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+    from mlflow.entities import LoggedModel
+    from mlflow.entities.model_registry import ModelVersion
+
+__all__ = ["ALIAS", "Contest", "PromotionError", "RegistryError", "is_better", "open_contest"]
+
+ALIAS = "champion"
+
+
+class PromotionError(UserError):
+    """A checkpoint that cannot be compared with the champion."""
+
+
+class RegistryError(RunError):
+    """An MLflow that does not answer, or has no registry."""
+
+
+@contextmanager
+def _asking(uri: str) -> Iterator[None]:
+    try:
+        yield
+    except (UserError, RunError):
+        raise
+    except Exception as error:  # noqa: BLE001  MLflow and what is below it raise many kinds
+        raise RegistryError(
+            f"--promote: MLflow at {redacted(uri)} does not answer as one with a registry of models: "
+            f"{in_words(error)}; wanted the MLflow that the run was tracked by; set MLFLOW_TRACKING_URI to it"
+        ) from None  # its text may hold secrets
+
+
+def open_contest(checkpoint: Checkpoint, experiment: Experiment, folder: Path) -> "Contest":
+    """Find the model of a checkpoint, and the champion that it is to be compared with.
+
+    Args:
+        checkpoint: the challenger's.
+        experiment: of its evaluation.
+        folder: for the champion's checkpoint and rows.
+
+    Raises:
+        PromotionError: if MLflow has no model of the checkpoint, or the champion is of another protocol.
+        RegistryError: if MLflow does not answer, or has no registry.
+    """
+    from mlflow import MlflowClient
+
+    uri, name = tracking_uri(), experiment.suite.name
+    with _asking(uri):
+        client = MlflowClient(uri)
+        challenger = _model_of(client, checkpoint)
+        found = client.search_registered_models(f"name = '{name}'")
+        has_one = bool(found) and ALIAS in found[0].aliases
+        champion = client.get_model_version_by_alias(name, ALIAS) if has_one else None
+        if champion is None or champion.source == _address(challenger.model_id):
+            return Contest(client, uri, experiment, challenger, champion, None, folder)
+        rival = Checkpoint(_downloaded(client, champion, uri, folder / "model"))
+    theirs = open_suite(rival.manifest.config.suite).protocol
+    if theirs != experiment.suite.protocol:
+        raise PromotionError(
+            f"--promote: got the protocol {experiment.suite.protocol!r}; wanted that of {name}'s champion, {theirs!r}; "
+            f"take the alias {ALIAS} from it in MLflow, and the next model has it"
+        )
+    return Contest(client, uri, experiment, challenger, champion, rival, folder)
+
+
+def _model_of(client: "MlflowClient", checkpoint: Checkpoint) -> "LoggedModel":
+    run_id, home = checkpoint.manifest.mlflow_run_id, checkpoint.path.absolute().parents[1]
+    if run_id is None and (home / IDENTITY).exists():  # MLflow was away when the checkpoint was written
+        run_id = Identity.of(home).run_id
+    found = [] if run_id is None else models_of(client, client.get_run(run_id))
+    for model in found:
+        if model.tags.get(CHECKPOINT_TAG) == checkpoint.digest:
+            return model
+    if run_id is None:
+        got = "which has no MLflow run"
+    else:
+        got = f"of which MLflow run {run_id} has no model, and {len(found)} of others"
+    raise PromotionError(
+        f"--checkpoint: got {checkpoint.path}, {got}; wanted the last checkpoint of a finished run of "
+        "services.meta_train; what MLflow did not take while the run was on it takes by: "
+        f"python -m services.tracking flush {home}"
+    )
+
+
+def _address(model_id: str) -> str:
+    """Return what a version says that it was made from: its id it does not always tell."""
+    return f"models:/{model_id}"
+
+
+def _downloaded(client: "MlflowClient", version: "ModelVersion", uri: str, folder: Path) -> Path:
+    """Return the folder of a version's checkpoint: none of a model's code is run."""
+    from mlflow.artifacts import download_artifacts
+
+    folder.mkdir(parents=True, exist_ok=True)
+    # Not by its address: that is looked up at the process's MLflow, which may be another.
+    place = client.get_logged_model((version.source or "").removeprefix(_address(""))).artifact_location
+    return checkpoint_in(Path(download_artifacts(artifact_uri=place, dst_path=str(folder), tracking_uri=uri)))
+
+
+@dataclass(frozen=True)
+class Contest:
+    """A model, and the one that it would take the alias from."""
+
+    client: "MlflowClient"
+    uri: str
+    experiment: Experiment
+    challenger: "LoggedModel"
+    champion: "ModelVersion | None"
+    rival: Checkpoint | None
+    """The champion's, if there is a champion and it is another model."""
+    folder: Path
+
+    def evaluate_rival(self, runner: Runner, data: Mapping[str, TaskDemonstrations]) -> None:
+        """Evaluate the champion, if it is another model, in the challenger's episodes."""
+        if self.rival is None:
+            return
+        ours, theirs = self.experiment.config, self.rival.manifest.config
+        own = {name: getattr(theirs.evaluation, name) for name in ("fine_tuning_steps", "learning_rate")}
+        config = theirs.model_copy(
+            update={
+                "seed": ours.seed,  # names the episodes
+                "suite": ours.suite,
+                "demonstrations": ours.demonstrations,
+                "evaluation": ours.evaluation.model_copy(update=own),
+            }
+        )
+        Experiment(config, self.experiment.store).evaluate(runner, data, self.rival, self.folder)
+
+    def settle(self, evaluation: Evaluation, folder: Path) -> list[str]:
+        """Register the challenger, move the alias if it is due, and return in words what was decided and why.
+
+        Args:
+            evaluation: of the challenger.
+            folder: of its rows.
+
+        Raises:
+            RegistryError: if MLflow does not answer.
+        """
+        name, champion = self.experiment.suite.name, self.champion
+        with _asking(self.uri):
+            version = self._registered(name)
+            if champion is None:
+                self.client.set_registered_model_alias(name, ALIAS, version)
+                return [f"{name}: version {version} is the first {ALIAS}"]
+            if self.rival is None:
+                return [f"{name}: version {version} is the {ALIAS} already"]
+            pairs = self._pairs(evaluation, folder, version)
+            lines = [_in_words(pair) for pair in pairs]
+            if not is_better(pairs):
+                return [*lines, f"{name}: the {ALIAS} stays version {champion.version}; version {version} is no better"]
+            self.client.set_registered_model_alias(name, ALIAS, version)
+            return [*lines, f"{name}: the {ALIAS} is now version {version}, in place of version {champion.version}"]
+
+    def _registered(self, name: str) -> str:
+        """Return the number of the challenger's version, which is made if there is none."""
+        if not self.client.search_registered_models(f"name = '{name}'"):
+            self.client.create_registered_model(name, description=f"Models of the suite {name}; see the alias {ALIAS}.")
+        model_id, run_id, tags = self.challenger.model_id, self.challenger.source_run_id, self.challenger.tags
+        for version in self.client.search_model_versions(f"name = '{name}'"):
+            if version.source == _address(model_id):
+                return version.version
+        made = self.client.create_model_version(name, _address(model_id), run_id, dict(tags), model_id=model_id)
+        return made.version
+
+    def _pairs(self, evaluation: Evaluation, folder: Path, version: str) -> Sequence[Difference | Unpaired]:
+        """Return how the challenger differs from the champion in meta-testing tasks, by the size of support sets."""
+        assert self.champion is not None
+        assert self.rival is not None
+        config, name = self.experiment.config, self.experiment.suite.name
+        ours, theirs = f"version {version}", f"version {self.champion.version}"
+        contenders = [
+            Contender(
+                folder=rows,
+                row=row,
+                suite=name,
+                seed=config.seed,
+                name=row,
+                config=checkpoint.manifest.config,
+                environment_steps=0,
+                home=rows,
+            )
+            for row, checkpoint, rows in (
+                (ours, evaluation.checkpoint, folder),
+                (theirs, self.rival, self.folder),
+            )
+        ]
+        return Comparison(
+            rows=[ours, theirs],
+            suites=[name],
+            splits=["meta-testing"],
+            shots=config.evaluation.shots,
+            metric="score" if evaluation.best_score > 1 else "success_rate",
+            by="variants",
+            baseline=theirs,
+            contenders=contenders,
+            published={},
+        ).pairs
+
+
+def is_better(pairs: Sequence[Difference | Unpaired]) -> bool:
+    """Tell whether a model is better outside the interval for some size of support sets, and worse so for none."""
+    answers = {pair.differs if isinstance(pair, Difference) else "not decided" for pair in pairs}
+    return "yes, higher" in answers and "yes, lower" not in answers
+
+
+def _in_words(pair: Difference | Unpaired) -> str:
+    where = f"{pair.row} against {pair.baseline}, {pair.split} {pair.shots}-shot"
+    if isinstance(pair, Unpaired):
+        return f"{where}: not compared: {pair.why}"
+    interval = f"95% interval {pair.low:+.3f} to {pair.high:+.3f}"
+    return f"{where}: {pair.mean:+.3f} ({interval}; {pair.pairs} pairs of episodes), higher? {pair.differs}"

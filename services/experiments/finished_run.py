@@ -1,0 +1,135 @@
+"""A run that has come to its end, as its folder tells of it."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from dmil_core.configs import ExperimentConfig
+from dmil_core.errors import UserError, explain
+from services.demonstrations.store import TaskDemonstrations, open_store
+from services.distributed.runner import LocalRunner
+from services.evaluation.results import EpisodeResult, EvaluationFolder, read_rows
+from services.evaluation.summary import Summary
+from services.experiments.experiment import Experiment
+from services.storage.checkpoints import Checkpoint, Checkpoints
+from services.storage.files import read_file
+from services.storage.run_folders import FolderError, find_folder
+from services.tracking.history import Origin, read_metrics, read_origin
+
+__all__ = ["FinishedRun", "UnfinishedError"]
+
+MARK, BEGUN, CHECKPOINTS = "summary.json", "config.json", "checkpoints"
+"""What the folder of a finished run is known by, what that of any run, and what no evaluation's has."""
+MOST_BYTES = 2**24
+"""In it."""
+
+
+class UnfinishedError(UserError):
+    """A run that has not come to its end, or of which there is not all that is to be shown."""
+
+
+@dataclass(frozen=True)
+class FinishedRun(EvaluationFolder):
+    """What ``meta_train`` left behind; each file is read when it is asked for, once."""
+
+    @staticmethod
+    def found(name: str, runs: Path) -> "FinishedRun":
+        """Return a run by its name in `runs`, or by its folder.
+
+        Raises:
+            FolderError: if there is no folder of a run.
+            UnfinishedError: if the run has not come to its end, or the folder is only that of an evaluation.
+        """
+        try:
+            folder = find_folder(name, runs, MARK, "RUN")
+        except FolderError as error:
+            for begun in (Path(name), runs / name):
+                if (begun / BEGUN).is_file():
+                    raise UnfinishedError(
+                        f"RUN: got {begun}, which has not come to its end; wanted a finished run, with a {MARK}; go on "
+                        f"with it: python -m services.meta_train --resume {begun}"
+                    ) from error
+            raise
+        if not (folder / CHECKPOINTS).is_dir():
+            raise UnfinishedError(
+                f"RUN: got {folder}, which has no {CHECKPOINTS}, as the folder of an evaluation; wanted that of a run "
+                "of services.meta_train"
+            )
+        return FinishedRun(folder)
+
+    @property
+    def name(self) -> str:
+        """Its folder's."""
+        return self.folder.name
+
+    @cached_property
+    def summary(self) -> Summary:
+        """Success rates, with all that belongs to them.
+
+        Raises:
+            UnfinishedError: if the file is not as a run writes it.
+        """
+        path = self.folder / MARK
+        try:
+            return Summary.model_validate_json(read_file(path, MOST_BYTES))
+        except ValidationError as error:
+            raise UnfinishedError(
+                f"{path}: got {'; '.join(explain(error).splitlines())}; wanted what a run writes at its end; "
+                f"write it again: python -m services.meta_train --resume {self.folder}"
+            ) from error
+
+    @cached_property
+    def checkpoint(self) -> Checkpoint:
+        """The last one.
+
+        Raises:
+            CheckpointError: if there is none, or it is damaged.
+        """
+        return Checkpoints(self.folder / CHECKPOINTS, kept=0).newest()
+
+    @cached_property
+    def config(self) -> ExperimentConfig:
+        """All settings."""
+        return self.checkpoint.manifest.config
+
+    @cached_property
+    def metrics(self) -> list[dict[str, float]]:
+        """Those of each iteration, under ``iteration`` its number."""
+        return read_metrics(self.folder)
+
+    @cached_property
+    def origin(self) -> Origin:
+        """What it was made of."""
+        return read_origin(self.folder)
+
+    @cached_property
+    def evaluations(self) -> dict[int, list[EpisodeResult]]:
+        """The rows of each evaluation by its iteration: those on the way, and the one of the last checkpoint."""
+        found = {
+            int(path.parent.name): read_rows(path, EpisodeResult)
+            for path in sorted((self.folder / "evaluations").glob("*/episodes.jsonl"))
+            if path.parent.name.isdecimal()
+        }
+        return found if self.has_gone_on else found | {self.checkpoint.manifest.iteration: self.episodes}
+
+    @property
+    def best_score(self) -> int:
+        """Of an episode in which all is done; 1 in suites without scores."""
+        return max((cell.score.best for cell in self.summary.rows if cell.score), default=1)
+
+    @property
+    def has_gone_on(self) -> bool:
+        """Whether it was trained on since its end, so that the last checkpoint is another than that evaluated."""
+        return self.checkpoint.digest != self.summary.checkpoint_digest
+
+    @cached_property
+    def experiment(self) -> Experiment:
+        """Its suite and method, put together again."""
+        return Experiment(self.config, open_store())
+
+    @cached_property
+    def demonstrations(self) -> dict[str, TaskDemonstrations]:
+        """Every task's, collected again where the store has lost them."""
+        return self.experiment.collect(LocalRunner(self.experiment.suite))

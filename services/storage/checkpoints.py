@@ -1,0 +1,283 @@
+"""Checkpoints: safetensors and a JSON manifest with a digest of every file, whole or not there at all."""
+
+import json
+import math
+import os
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from dmil_core.configs import ExperimentConfig
+from dmil_core.errors import UserError, explain, shown
+from dmil_core.networks import flatten
+from dmil_core.outer_loop import OuterState
+from services.cli.progress import console
+from services.storage.checksums import checked_file, listing, sha256
+from services.storage.files import inside, read_file, room_for, sync
+
+__all__ = ["FILES", "SEAL", "Checkpoint", "CheckpointError", "Checkpoints", "Manifest"]
+
+MANIFEST, SEAL = "manifest.json", "manifest.sha256"
+PARAMETERS, OPTIMISER, CONSTANTS = "parameters.safetensors", "optimiser.safetensors", "constants.safetensors"
+MOST_MANIFEST = 2**22
+"""Bytes of a manifest."""
+MOST_TENSORS = 2**32
+"""Bytes of all parameters together: a hundred times those of the paper's networks."""
+MOST_CONSTANTS = 2**26
+"""Bytes of what a method learned once."""
+MOST_HEADER = 2**20
+"""Bytes of a file of tensors besides the tensors."""
+FILES = {
+    PARAMETERS: MOST_TENSORS + MOST_HEADER,
+    OPTIMISER: 2 * MOST_TENSORS + MOST_HEADER,
+    CONSTANTS: MOST_CONSTANTS,
+    MANIFEST: MOST_MANIFEST,
+}
+"""What a checkpoint has besides its seal, and the most bytes of each."""
+
+Side = Annotated[int, Field(ge=1, le=MOST_TENSORS)]
+Shape = Annotated[tuple[Side, ...], Field(min_length=1, max_length=8)]
+
+
+class CheckpointError(UserError):
+    """A checkpoint that is missing or damaged."""
+
+
+class Manifest(BaseModel):
+    """What a checkpoint says of itself, ``manifest.json``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    iteration: Annotated[int, Field(ge=0, lt=2**63)]
+    """Outer steps done; the one unit of progress everywhere."""
+    loss: float | None
+    """Mean loss after adaptation since the checkpoint before, by which the best is chosen."""
+    config: ExperimentConfig
+    shapes: dict[str, Shape]
+    """Names and shapes of the parameters, in the order in which they are laid out flat; none of a method that learns
+    nothing."""
+    environment_steps: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    """Taken in meta-training, by a method that practises."""
+    data: dict[str, str]
+    """The SHA-256 of each task's demonstrations."""
+    versions: dict[str, str]
+    mlflow_run_id: str | None
+    files: dict[str, str] = {}
+    """The SHA-256 of every file of tensors."""
+
+    @field_validator("shapes")
+    @classmethod
+    def _can_be_held(cls, shapes: dict[str, Shape]) -> dict[str, Shape]:
+        if odd := [name for name, shape in shapes.items() if name.endswith(".weight") and len(shape) < 2]:
+            raise ValueError(f"shapes: got {shapes[odd[0]]} for {shown(odd[0])}; wanted a matrix")
+        if (total := 4 * sum(map(math.prod, shapes.values()))) > MOST_TENSORS:
+            raise ValueError(f"shapes: got {total} bytes of parameters; wanted at most {MOST_TENSORS}")
+        return shapes
+
+    @property
+    def size(self) -> int:
+        """The number of all parameters together."""
+        return sum(map(math.prod, self.shapes.values()))
+
+    @property
+    def digest(self) -> str:
+        """What a result row names the checkpoint by.
+
+        The SHA-256 of the manifest as canonical JSON, and so of all tensors, settings and data, but without `loss` and
+        `mlflow_run_id`: they differ between a run that was disturbed and one that was not, which end alike otherwise.
+        """
+        identity = self.model_dump(mode="json", exclude={"loss", "mlflow_run_id"})
+        identity["shapes"] = list(identity["shapes"].items())  # their order is the parameters' order
+        return sha256(json.dumps(identity, sort_keys=True, separators=(",", ":")).encode())
+
+
+class Checkpoint:
+    """One checkpoint, read and found whole."""
+
+    def __init__(self, path: Path) -> None:
+        """Read a checkpoint's folder.
+
+        Raises:
+            CheckpointError: names the file that is missing, not as its digest says or not as the manifest describes.
+        """
+        self.path = path
+        self.manifest = _read_manifest(path)
+        self.digest = self.manifest.digest
+        """What result rows name the checkpoint by."""
+        self.parameters: Mapping[str, np.ndarray] = self._read(PARAMETERS, self.manifest.shapes)
+        """The parameters by name, in their flat order."""
+        flat = (self.manifest.size,)
+        self._moments = self._read(OPTIMISER, {"first_moment": flat, "second_moment": flat})
+        self.constants: Mapping[str, np.ndarray] = self._read(CONSTANTS, None)
+        """What the method learned once from the data."""
+
+    def _read(self, name: str, shapes: Mapping[str, Sequence[int]] | None) -> dict[str, np.ndarray]:
+        """Return the tensors of a file, which have these names and shapes, in this order."""
+        most = MOST_CONSTANTS if shapes is None else 4 * sum(map(math.prod, shapes.values())) + MOST_HEADER
+        try:
+            tensors = load(checked_file(self.path, name, self.manifest.files.get(name), most))
+        except OSError as error:
+            raise self._damaged(name, _in_words(error), "what its digest in the manifest says") from error
+        except (SafetensorError, KeyError, ValueError, TypeError, OverflowError) as error:  # KeyError: an odd dtype
+            raise self._damaged(name, f"{type(error).__name__}, {str(error)[:200]}", "safetensors") from error
+        if odd := [key for key, tensor in tensors.items() if tensor.dtype != np.float32]:
+            raise self._damaged(name, f"{tensors[odd[0]].dtype} in {shown(odd[0])}", "float32 only")
+        if shapes is None:
+            return tensors
+        found = {key: tensor.shape for key, tensor in tensors.items()}
+        if found != {key: tuple(shape) for key, shape in shapes.items()}:
+            raise self._damaged(name, f"tensors {shown(found)}", f"the manifest's {shown(dict(shapes))}")
+        return {key: tensors[key] for key in shapes}
+
+    def _damaged(self, name: str, got: str, wanted: str) -> CheckpointError:
+        return CheckpointError(f"{self.path / name}: got {got}; wanted {wanted}; use another checkpoint")
+
+    @property
+    def state(self) -> OuterState:
+        """The learner's state, a new copy each time."""
+        flat = flatten({name: torch.from_numpy(array) for name, array in self.parameters.items()}).numpy()
+        return OuterState(
+            self.manifest.iteration, flat, **{name: array.copy() for name, array in self._moments.items()}
+        )
+
+
+class Checkpoints:
+    """The checkpoints of one run, in its folder ``checkpoints``."""
+
+    def __init__(self, folder: Path, kept: int) -> None:
+        """Keep the newest `kept` checkpoints, and the best besides."""
+        self.folder = folder
+        self.kept = kept
+        self.spares: Callable[[int], bool] = lambda iteration: False
+        """Tells by its iteration whether a checkpoint is still needed, and so not let go."""
+
+    def all(self) -> list[Path]:
+        """Return the checkpoints' folders, oldest first."""
+        return sorted(path for path in self.folder.glob("iteration-*") if path.is_dir())
+
+    def newest(self) -> Checkpoint:
+        """Read the newest checkpoint that is whole, and name damaged ones that are newer in a warning.
+
+        Raises:
+            CheckpointError: if there is none.
+        """
+        paths = self.all()
+        complaints: list[str] = []
+        for path in reversed(paths):
+            try:
+                found = Checkpoint(self._inside(path))
+            except CheckpointError as error:
+                complaints.append(" ".join(str(error).splitlines()))
+            else:
+                if complaints:
+                    console.print(f"warning: {' | '.join(complaints)}; taking {path} instead", markup=False)
+                return found
+        damaged = f"{len(paths)} checkpoints, none of them whole" if paths else "no checkpoint"
+        raise CheckpointError("\n".join([f"{self.folder}: got {damaged}; wanted one; start the run anew", *complaints]))
+
+    def _inside(self, path: Path) -> Path:
+        try:
+            inside(self.folder, path.name)
+        except OSError as error:
+            raise CheckpointError(f"{path}: got a link out of {self.folder}; wanted a folder in it") from error
+        return path
+
+    def save(
+        self,
+        state: OuterState,
+        parameters: Mapping[str, np.ndarray],
+        constants: Mapping[str, np.ndarray],
+        manifest: Manifest,
+    ) -> Path:
+        """Write a checkpoint beside, sync it, rename it, and let go of those that are no longer kept.
+
+        Raises:
+            DiskFullError: for want of space; what was written by then is removed.
+        """
+        path = self.folder / f"iteration-{state.iteration:07d}"
+        writing = self.folder / f".writing-{os.getpid()}"
+        contents: dict[str, Mapping[str, np.ndarray]] = {
+            PARAMETERS: parameters,
+            OPTIMISER: {"first_moment": state.first_moment, "second_moment": state.second_moment},
+            CONSTANTS: constants,
+        }
+        files = {
+            name: save({key: np.ascontiguousarray(value) for key, value in tensors.items()})
+            for name, tensors in contents.items()
+        }
+        digests = {name: sha256(content) for name, content in files.items()}
+        text = json.dumps({**manifest.model_dump(mode="json"), "files": digests}, indent=1).encode()
+        files |= {MANIFEST: text, SEAL: listing({MANIFEST: sha256(text)}).encode()}
+        for abandoned in self.folder.glob(".writing-*"):  # by a writer that was killed
+            shutil.rmtree(abandoned)
+        try:
+            with room_for(path, sum(map(len, files.values()))):
+                writing.mkdir(parents=True)
+                for name, content in files.items():
+                    (writing / name).write_bytes(content)
+                for name in (*files, "."):
+                    sync(writing / name)
+                shutil.rmtree(path, ignore_errors=True)
+                writing.replace(path)
+                sync(self.folder)
+        finally:
+            shutil.rmtree(writing, ignore_errors=True)
+        self._let_go()
+        return path
+
+    def best(self) -> Path | None:
+        """Return the checkpoint with the least loss, of those that are not damaged."""
+        scored = {path: loss for path, loss in self._sound().items() if loss is not None and math.isfinite(loss)}
+        return min(scored, key=lambda path: scored[path]) if scored else None
+
+    def _sound(self) -> dict[Path, float | None]:
+        """Return the loss of each checkpoint, oldest first, without those that a look at their files finds damaged."""
+        found: dict[Path, float | None] = {}
+        for path in self.all():
+            try:
+                found[path] = _read_manifest(self._inside(path)).loss
+            except CheckpointError:
+                continue
+        return found
+
+    def _let_go(self) -> None:
+        """Remove what is older than the newest `kept` whole checkpoints, damaged ones too, but not the best."""
+        whole, best = list(self._sound()), self.best()
+        for path in self.all() if len(whole) > self.kept else []:
+            needed = path == best or path.is_symlink() or self.spares(int(path.name.partition("-")[2]))
+            if path < whole[-self.kept] and not needed:
+                shutil.rmtree(path)
+
+
+def _read_manifest(path: Path) -> Manifest:
+    """Read the manifest of the checkpoint `path`, and see whether the files it speaks of are there.
+
+    Raises:
+        CheckpointError: if not.
+    """
+    try:
+        text = read_file(inside(path, MANIFEST), MOST_MANIFEST)
+        if read_file(inside(path, SEAL), 200).decode("ascii", "replace") != listing({MANIFEST: sha256(text)}):
+            raise OSError(f"a file whose SHA-256 is not the one in {SEAL}")
+        manifest = Manifest.model_validate_json(text)
+    except (OSError, ValidationError) as error:
+        got = _in_words(error) if isinstance(error, OSError) else "; ".join(explain(error, "manifest").splitlines())
+        raise CheckpointError(
+            f"{path / MANIFEST}: got {got}; wanted a checkpoint's manifest; use another checkpoint"
+        ) from error
+    for name, least in {PARAMETERS: 4 * manifest.size, OPTIMISER: 8 * manifest.size, CONSTANTS: 1}.items():
+        found = (path / name).stat().st_size if (path / name).is_file() else 0
+        if found < least:
+            raise CheckpointError(f"{path / name}: got {found} bytes; wanted at least {least}; use another checkpoint")
+    return manifest
+
+
+def _in_words(error: OSError) -> str:
+    return f"{error.strerror} ({error.filename})" if error.filename else str(error)

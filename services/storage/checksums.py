@@ -1,0 +1,75 @@
+"""SHA-256 digests beside the files they are of, in the form that ``sha256sum --check`` reads too."""
+
+import errno
+import hashlib
+import os
+import stat
+from collections.abc import Sequence
+from pathlib import Path
+
+from services.storage.files import inside, read_file, write_file
+
+__all__ = ["check_listing", "checked_file", "listing", "sha256", "write_listing"]
+
+MOST_LISTED = 2**16
+"""Bytes of a listing."""
+
+
+def sha256(content: bytes) -> str:
+    """Return the SHA-256 of `content`, in hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def listing(digests: dict[str, str]) -> str:
+    """Return digests by file name as ``sha256sum`` lays them out."""
+    return "".join(f"{digest}  {name}\n" for name, digest in digests.items())
+
+
+def checked_file(folder: Path, name: str, digest: str | None, most: int) -> bytes:
+    """Return the content of a file in `folder` whose digest is `digest`.
+
+    Raises:
+        OSError: if it is missing, a link out of the folder, of more than `most` bytes, or has another digest.
+    """
+    content = read_file(inside(folder, name), most)
+    _compare(sha256(content), digest, folder / name)
+    return content
+
+
+def write_listing(folder: Path, name: str, files: Sequence[str]) -> None:
+    """Write the digests of `files`, paths inside `folder`, to the file `name` in it."""
+    write_file(folder / name, listing({file: _digest(folder / file) for file in files}))
+
+
+def check_listing(folder: Path, name: str, most: dict[str, int]) -> None:
+    """Check the files in `folder` whose digests the file `name` in it lists.
+
+    Args:
+        folder: holds the files; nothing outside of it is read.
+        name: of the listing.
+        most: the files that must be listed, with the bytes that each may have.
+
+    Raises:
+        OSError: names the file that is missing, too large, a link out of the folder or not as its digest says.
+    """
+    lines = read_file(inside(folder, name), MOST_LISTED).decode("utf-8", "replace").splitlines()
+    listed = {file: digest for digest, _, file in (line.partition("  ") for line in lines)}
+    if len(lines) != len(listed) or listed.keys() != most.keys():
+        raise OSError(errno.EBADMSG, f"does not list {', '.join(most)}, each once", str(folder / name))
+    for file, bound in most.items():
+        path = inside(folder, file)
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode) or found.st_size > bound:
+            raise OSError(errno.EFBIG, f"no regular file of at most {bound} bytes", str(path))
+        _compare(_digest(path), listed[file], path)
+
+
+def _digest(path: Path) -> str:
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _compare(found: str, wanted: str | None, path: Path) -> None:
+    if found != wanted:
+        listed = f"not {wanted[:12]} as listed" if wanted else "none is listed"
+        raise OSError(errno.EBADMSG, f"damaged: its SHA-256 is {found[:12]}, {listed}", str(path))

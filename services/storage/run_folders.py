@@ -1,0 +1,63 @@
+"""The folders of runs and sweeps: made under a name, and found by it or by their path."""
+
+from pathlib import Path
+
+from dmil_core.errors import UserError, shown
+from services.storage.files import inside
+
+__all__ = ["FolderError", "find_folder", "new_folder"]
+
+
+class FolderError(UserError):
+    """A name that no folder can have or has."""
+
+
+def new_folder(name: str, runs: Path, mark: str) -> Path:
+    """Return the folder of a new run or sweep; it is not made yet.
+
+    Args:
+        name: of the folder.
+        runs: where it is to lie.
+        mark: the file by which the folder of one that was begun is known.
+
+    Raises:
+        FolderError: if the name is none, or taken.
+    """
+    if name in (".", "..") or Path(name).name != name:
+        raise FolderError(f"--name: got {shown(name)}; wanted the name of a folder in {runs}, without any /")
+    folder = _held(runs / name, runs, "--name")
+    if (folder / mark).exists():
+        raise FolderError(f"--name: got {folder}, which is taken; wanted a new name, or --resume {folder}")
+    return folder
+
+
+def find_folder(name: str, runs: Path, mark: str, flag: str = "--resume") -> Path:
+    """Return the folder of a run or sweep that was begun.
+
+    Args:
+        name: its path, or its name in `runs`.
+        runs: where it lies.
+        mark: the file by which it is known.
+        flag: that `name` was given by.
+
+    Raises:
+        FolderError: if there is none.
+    """
+    for folder in (Path(name), runs / name):
+        if (folder / mark).is_file():
+            return _held(folder, runs, flag)
+    raise FolderError(f"{flag}: got {shown(name)}; wanted a folder with a {mark} in it, or the name of one in {runs}")
+
+
+def _held(folder: Path, runs: Path, flag: str) -> Path:
+    """Return a folder, unless it seems to lie in `runs` and is a link that leads elsewhere.
+
+    Raises:
+        FolderError: then, because whatever is written would be written there.
+    """
+    if folder.parent.absolute() == runs.absolute():
+        try:
+            inside(runs, folder.name)
+        except OSError as error:
+            raise FolderError(f"{flag}: got {folder}, a link out of {runs}; wanted a folder in it") from error
+    return folder

@@ -1,0 +1,237 @@
+"""Lay the table of a sweep beside the paper's: on the terminal, in files of several forms, as a page, in MLflow."""
+
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+import yaml
+from rich.table import Table
+
+from services.cli.arguments import parse
+from services.cli.progress import console
+from services.evaluation.comparison import DIGITS, Cell, Difference, Unpaired
+from services.reporting.means import draw_means
+from services.storage.files import write_file
+from services.storage.run_folders import find_folder
+from services.sweeps.compare import write_sweep_page
+from services.sweeps.folders import MARK, SweepFolder
+from services.sweeps.tables import Sample, Tables, column_of, comparison_of, tables_of
+from services.tracking import Tracker
+
+__all__ = ["publish", "run", "show", "write_tables"]
+
+
+def _grid(tables: Tables) -> dict[str, dict[str, Cell]]:
+    grid: dict[str, dict[str, Cell]] = {row: {} for row in tables.rows}
+    for found in tables.cells:
+        grid[found.suite if tables.by == "suites" else found.row][column_of(found, tables.by)] = found
+    return grid
+
+
+def _figures(found: Cell | None, digits: int) -> list[str]:
+    """Return a cell's mean and the paper's, a line each: none if it was not run."""
+    if found is None:
+        return []
+    interval = "" if found.low is None else f" ({found.low:.{digits}f} to {found.high:.{digits}f})"
+    lines = [f"{found.mean:.{digits}f}{interval}"]
+    if found.paper is not None:
+        mark = " outside" if found.outside else ""
+        lines.append(f"paper {found.paper.in_words(digits)}: {found.difference:+.{digits}f}{mark}")
+    return lines
+
+
+def _lines(found: Cell | None, digits: int) -> list[str]:
+    """Return a cell's figures, and what they come from."""
+    if found is None:
+        return []
+    lines = _figures(found, digits)
+    if found.environment_steps:
+        lines.append(f"{found.environment_steps:,} environment steps")
+    if found.sub_skills_in_use is not None:
+        lines.append(f"{found.sub_skills_in_use:.1f} sub-skills in use")
+    plural = "seed" if len(found.seeds) == 1 else "seeds"
+    return [*lines, f"{len(found.seeds)} {plural}, {found.episodes} episodes"]
+
+
+def _head(tables: Tables) -> str:
+    trials = ", ".join(f"{count} {status}" for status, count in tables.trials.items())
+    against = f"; beside it {tables.paper.replace('table', 'Table ')} of the paper" if tables.paper else ""
+    return f"{tables.what}: {tables.metric.replace('_', ' ')} at scale {tables.size}{against} (trials: {trials})"
+
+
+def show(tables: Tables, sweep: SweepFolder) -> None:
+    """Print the table, the differences, what failed, and where all of it is written."""
+    digits = DIGITS[tables.metric]
+    if tables.samples:
+        console.print(_samples_view(tables))
+    else:
+        grid = _grid(tables)
+        view = Table(
+            "", *[column.replace(", ", "\n") for column in tables.columns], title=_head(tables), show_lines=True
+        )
+        for row in tables.rows:
+            view.add_row(row, *["\n".join(_lines(grid[row].get(column), digits)) for column in tables.columns])
+        console.print(view)
+    if tables.differences:
+        view = Table("row", "against", "where", "difference", "95% interval", "pairs", "seeds", "differs?")
+        for found in tables.differences:
+            view.add_row(*_difference_fields(found, digits))
+        console.print(view)
+    for found in tables.unpaired:
+        console.print(_not_compared(found), markup=False)
+    for name, error in tables.failed.items():
+        console.print(f"failed: {name}: {error}", markup=False)
+    console.print(f"tables: {sweep.path / 'tables'}")
+    console.print(f"page: {sweep.path / 'tables' / 'report.html'}")
+
+
+def _samples_view(tables: Tables) -> Table:
+    view = Table("sample", "suite", "seed", "status", "iterations", "held out", "settings", title=_head(tables))
+    for sample in tables.samples:
+        view.add_row(*_sample_fields(sample))
+    return view
+
+
+def _sample_fields(sample: Sample) -> list[str]:
+    held_out = "" if sample.held_out is None else f"{sample.held_out:.3f}"
+    settings = yaml.safe_dump(sample.settings, default_flow_style=True, width=1000).strip()
+    return [sample.sample, sample.suite, str(sample.seed), sample.status, str(sample.iteration), held_out, settings]
+
+
+def _difference_fields(found: Difference, digits: int) -> list[str]:
+    where = f"{found.suite}, {found.split}, {found.shots}-shot"
+    interval = f"{found.low:+.{digits}f} to {found.high:+.{digits}f}"
+    fields = [found.row, found.baseline, where, f"{found.mean:+.{digits}f}", interval]
+    return [*fields, str(found.pairs), str(len(found.seeds)), found.differs]
+
+
+def _not_compared(found: Unpaired) -> str:
+    where = f"{found.suite}, {found.split}, {found.shots}-shot"
+    return f"Not compared: {found.row} with {found.baseline} ({where}): {found.why}"
+
+
+def write_tables(sweep: SweepFolder) -> Tables:
+    """Write the folder ``tables``: JSON, Markdown, CSV, LaTeX, a plot, a page; of a search also the best settings."""
+    comparison = comparison_of(sweep)
+    tables = tables_of(sweep, comparison)
+    folder = sweep.path / "tables"
+    folder.mkdir(exist_ok=True)
+    write_file(folder / "tables.json", tables.model_dump_json(indent=1) + "\n")
+    write_file(folder / "table.md", _markdown(tables))
+    write_file(folder / "cells.csv", _csv([_flat(found) for found in tables.cells]))
+    write_file(folder / "differences.csv", _csv([found.model_dump() for found in tables.differences]))
+    write_file(folder / "table.tex", _latex(tables))
+    if tables.samples:
+        best = yaml.safe_dump(tables.samples[0].settings, sort_keys=False)
+        write_file(folder / "best.yaml", f"# {_head(tables)}; {tables.command}\n{best}")
+    if tables.cells:
+        draw_means(comparison, folder / "table.png", _head(tables))
+    write_sweep_page(tables, comparison, folder / "report.html")
+    return tables
+
+
+def _flat(found: Cell) -> dict[str, object]:
+    row = found.model_dump()
+    paper = row.pop("paper")
+    row["paper"], row["paper_spread"] = (paper["value"], paper["spread"]) if paper else (None, None)
+    return row
+
+
+def _csv(rows: Sequence[Mapping[str, object]]) -> str:
+    text = io.StringIO()
+    if rows:
+        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({key: " ".join(map(str, v)) if isinstance(v, list) else v for key, v in row.items()})
+    return text.getvalue()
+
+
+def _markdown(tables: Tables) -> str:
+    digits, grid = DIGITS[tables.metric], _grid(tables)
+    lines = [_head(tables) + ".", "", f"Begun {tables.began}, commit {tables.commit[:12]}: `{tables.command}`", ""]
+    if tables.samples:
+        lines += _rows(["sample", "suite", "seed", "status", "iterations", "held out", "settings"])
+        lines += [_row(_sample_fields(sample)) for sample in tables.samples]
+    else:
+        lines += _rows(["", *tables.columns])
+        for row in tables.rows:
+            lines.append(_row([row, *["<br>".join(_lines(grid[row].get(c), digits)) for c in tables.columns]]))
+    if tables.cells:
+        lines += ["", "Interquartile means over tasks and seeds; sub-skills with over a tenth of a task's states:", ""]
+        lines += _rows(["row", "where", "interquartile mean", "sub-skills in use", "interval"])
+        for found in tables.cells:
+            where = f"{found.suite}, {found.split}, {found.shots}-shot"
+            middle = f"{found.interquartile_mean:.{digits}f}"
+            in_use = "" if found.sub_skills_in_use is None else f"{found.sub_skills_in_use:.1f}"
+            lines.append(_row([found.row, where, middle, in_use, found.interval]))
+    if tables.differences:
+        lines += ["", "On the same seeds and episodes:", ""]
+        lines += _rows(["row", "against", "where", "difference", "95% interval", "pairs", "seeds", "differs?"])
+        lines += [_row(_difference_fields(found, digits)) for found in tables.differences]
+    lines += [f"\n{_not_compared(found)}" for found in tables.unpaired]
+    lines += [f"\nFailed: {name}: {' '.join(error.split())}" for name, error in tables.failed.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _rows(head: Sequence[str]) -> list[str]:
+    return [_row(head), _row(["---"] * len(head))]
+
+
+def _row(fields: Iterable[str]) -> str:
+    return f"| {' | '.join(field.replace('|', '/') for field in fields)} |"
+
+
+_TEX = str.maketrans(
+    {c: f"\\{c}" for c in "&%$#_{}"} | {"\\": r"\textbackslash{}", "λ": r"$\lambda$", "σ": r"$\sigma$"}
+)
+
+
+def _latex(tables: Tables) -> str:
+    """Lay the table out for the package booktabs."""
+    digits, grid = DIGITS[tables.metric], _grid(tables)
+
+    def stacked(lines: list[str]) -> str:
+        return r"\shortstack{" + r" \\ ".join(line.translate(_TEX) for line in lines) + "}" if lines else ""
+
+    lines = [f"% {_head(tables)}; {tables.command}", rf"\begin{{tabular}}{{l{'c' * len(tables.columns)}}}", r"\toprule"]
+    head = [stacked(column.split(", ")) for column in tables.columns]
+    lines += [" & ".join(["", *head]) + r" \\", r"\midrule"]
+    for row in tables.rows:
+        own = [stacked(_figures(grid[row].get(column), digits)) for column in tables.columns]
+        lines.append(" & ".join([row.translate(_TEX), *own]) + r" \\")
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
+
+
+def publish(tracker: Tracker, tables: Tables, sweep: SweepFolder) -> None:
+    """Record the table, its plot and its means on the sweep's MLflow run."""
+    tracker.metrics(0, {_metric_name(found): found.mean for found in tables.cells}, anew=True)
+    tracker.tags({"mlflow.note.content": _markdown(tables)})
+    tracker.artifact(sweep.path / "tables", "tables")
+    tracker.artifact(sweep.path / MARK)
+
+
+def _metric_name(found: Cell) -> str:
+    """Return a name of characters that MLflow takes."""
+    name = f"{found.row}/{found.suite}/{found.split}/{found.shots}-shot"
+    return "".join(c if c.isascii() and (c.isalnum() or c in "/_-. ") else "_" for c in name)
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Arguments of ``report tables``."""
+
+    sweep: tyro.conf.Positional[str]
+    """Name or folder of a sweep, which may be still under way."""
+    runs: Path = Path("runs")
+    """The folder that sweeps' own folders are in."""
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run the program."""
+    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
+    sweep = SweepFolder(find_folder(given.sweep, given.runs, MARK, "SWEEP"))
+    show(write_tables(sweep), sweep)

@@ -1,0 +1,150 @@
+"""Settings from preset, file and flags, and mistakes that are answered with what is allowed."""
+
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dmil_core.configs import PRESETS
+from services.cli.arguments import PROGRAMS, ConfigError, config_from, parse
+from services.meta_train import Arguments, run
+
+
+def settings(*flags: str, preset: str = "ml10-smoke", file: Path | None = None) -> Any:
+    return parse(Arguments, "", flags, Arguments(config_from(preset, file))).experiment
+
+
+@pytest.fixture
+def yaml_file(tmp_path: Path):
+    def write(text: str) -> Path:
+        path = tmp_path / "settings.yaml"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_the_paper_preset_is_table_9_to_the_letter():
+    paper = PRESETS["ml10-paper"]
+    method: Any
+    method, training = paper.method, paper.training
+    assert (method.inner_learning_rate, training.learning_rate) == (5e-4, 1e-4)
+    assert (method.inner_steps, method.trajectories, method.continuity_weight) == (3, 16, 0.1)
+    assert (method.sub_skills, method.hidden_layers, method.hidden_units) == (3, 4, 512)
+    assert (method.order, method.window, training.gradient_clip) == ("second", None, None)
+    assert (paper.evaluation.shots, paper.evaluation.episodes) == ((1, 3), 20)
+    assert (paper.suite.name, paper.suite.train_tasks, paper.suite.test_tasks) == ("ml10", None, None)
+
+
+def test_a_file_overrides_the_preset_and_a_flag_overrides_the_file(yaml_file):
+    file = yaml_file("seed: 3\nmethod: {sub_skills: 5, window: null}\nsuite: {train_tasks: [reach, push]}\n")
+    found = settings("--method.sub-skills", "7", "--evaluation.shots", "2", file=file)
+    preset: Any = PRESETS["ml10-smoke"]
+    assert (found.seed, found.method.sub_skills, found.method.window) == (3, 7, None)
+    assert found.suite.train_tasks == ("reach", "push")
+    assert found.evaluation.shots == (2,)
+    assert found.method.inner_learning_rate == preset.method.inner_learning_rate
+    assert found.training == preset.training
+    assert settings(file=file).method.sub_skills == 5
+    assert settings() == preset
+
+
+def test_a_setting_that_may_be_none_can_be_given_and_taken_back():
+    assert settings("--method.window", "None").method.window is None
+    assert settings("--method.window", "9", preset="ml10-paper").method.window == 9
+    assert settings("--training.gradient-clip", "2.5").training.gradient_clip == 2.5
+
+
+MISTAKES = {
+    "unknown flag": (("--method.sub-skill-count", "5"), ("--method.sub-skill-count",)),
+    "no number": (("--method.sub-skills", "many"), ("--method.sub-skills", "many")),
+    "impossible number": (("--method.sub-skills", "0"), ("sub_skills", "input_value=0", "greater than or equal to 1")),
+    "negative rate": (("--training.learning-rate", "-1"), ("learning_rate", "-1.0", "greater than 0")),
+    "not a choice": (("--method.order", "third"), ("--method.order", "third", "first", "second")),
+    "more held out than there are": (("--demonstrations.held-out", "12"), ("held_out", "12", "wanted fewer")),
+    "more support than is held out": (("--evaluation.shots", "9"), ("held_out", "got 4", "wanted at least 9")),
+    "unknown task": (("--suite.train-tasks", "fly"), ("suite.train_tasks", "got fly", "reach", "push")),
+    "no task": (("--suite.train-tasks",), ("train_tasks", "input_value=()", "at least 1")),
+    "no workers": (("--workers", "0"), ("--workers", "got 0", "at least 1")),
+    "unknown preset": (("--preset", "ml99"), ("--preset", "ml99", "ml10-paper", "ml10-quick", "ml10-smoke")),
+    "no preset": (("--preset",), ("--preset",)),
+}
+LAUGHS = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}, *{a}, *{a}]\n" for a, b in pairwise("abcdefghijklmnop"))
+FILES = {
+    "unknown key": ("method: {sub_skill: 5}", ("method.sub_skill", "sub_skills", "continuity_weight")),
+    "unknown section": ("methods: {}", ("methods", "method", "training")),
+    "wrong type": ("training: {iterations: soon}", ("training.iterations", "'soon'", "integer")),
+    "half a number": ("training: {iterations: 2.5}", ("training.iterations", "2.5", "integer")),
+    "value for a section": ("method: 5", ("method", "got 5", "sub_skills")),
+    "not a number": ("method: {continuity_weight: .nan}", ("method.continuity_weight", "nan")),
+    "list": ("- seed", ("list", "wanted keys")),
+    "empty": ("", ("NoneType", "wanted keys")),
+    "alias": ("seed: &s 1\ntraining: {iterations: *s}", ("settings.yaml", "found an alias", "line 2")),
+    "billion laughs": (LAUGHS, ("settings.yaml", "found an alias")),
+    "deep": ("method: " + "[" * 500, ("settings.yaml", "deep nesting")),
+    "large": ("seed: " + "1" * 70_000, ("settings.yaml", "of 70006 bytes, of which at most 65536 are read")),
+    "no day": ("seed: 2001-99-99", ("settings.yaml", "month must be in 1..12")),
+    "huge number": ("seed: 0x" + "f" * 9000, ("settings.yaml: seed: got an integer of 36000 bits", "less than")),
+    "long value": ("method: {order: " + "x" * 9000 + "}", ("settings.yaml: method.order: got 'xxx",)),
+    "code": ("seed: !!python/object/apply:os.system [ls]", ("settings.yaml", "could not determine a constructor")),
+    "too many": ("method: {hidden_units: 1000000}", ("method.hidden_units: got 1000000", "10000")),
+    "no text": ("seed: \0", ("settings.yaml", "unacceptable character")),
+    "no YAML": ("seed: [1", ("settings.yaml", "wanted a readable YAML file")),
+}
+
+
+@pytest.mark.usefixtures("workplace")
+@pytest.mark.parametrize(("flags", "words"), MISTAKES.values(), ids=MISTAKES)
+def test_a_wrong_flag_is_answered_with_what_is_allowed(complaint, flags, words):
+    printed = complaint(run, "--runner", "local", *([] if "--preset" in flags else ["--preset", "ml10-smoke"]), *flags)
+    assert all(word in printed for word in words), printed
+    assert not list(Path().glob("runs/*/checkpoints"))
+
+
+@pytest.mark.usefixtures("workplace")
+@pytest.mark.parametrize(("text", "words"), FILES.values(), ids=FILES)
+def test_a_wrong_file_is_answered_with_what_is_allowed(complaint, yaml_file, text, words):
+    printed = complaint(run, "--runner", "local", "--preset", "ml10-smoke", "--config", str(yaml_file(text)))
+    assert all(word in printed for word in words), printed
+    assert len(printed) < 1000, "a message is to be read"
+
+
+@pytest.mark.parametrize("file", ["nowhere.yaml", "."])
+def test_a_file_that_cannot_be_read_is_named(file: str):
+    with pytest.raises(ConfigError, match=r"--config: got .*; wanted a readable YAML file"):
+        config_from("ml10-smoke", Path(file))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("--method.order", "third"), ("--method.sub-skills", "0"), ("--config", "nowhere.yaml")],
+    ids=" ".join,
+)
+def test_a_mistake_ends_the_program_with_exit_code_2(programs, arguments):
+    code, printed = programs("meta_train", *arguments)
+    assert code == 2
+    assert arguments[-1] in printed
+    assert "Traceback" not in printed
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_each_program_explains_itself(programs, name: str):
+    code, printed = programs(name.replace("-", "_"), "--help")
+    assert code == 0
+    assert f"usage: python -m services.{name.replace('-', '_')} " in printed
+    assert {"tune-sweep": "--scale", "report": "tables", "doctor": "--runs"}.get(name, "--runner") in printed
+
+
+def test_the_console_script_lists_the_programs():
+    dmil = Path(sys.executable).with_name("dmil")
+    listed = subprocess.run([dmil, "--help"], capture_output=True, text=True, timeout=60)
+    assert listed.returncode == 0
+    assert all(name in listed.stdout for name in PROGRAMS)
+    unknown = subprocess.run([dmil, "fly"], capture_output=True, text=True, timeout=60)
+    assert unknown.returncode == 2
+    assert "got the program 'fly'; wanted one of meta-train" in unknown.stderr
+    helped = subprocess.run([dmil, "evaluate", "--help"], capture_output=True, text=True, timeout=60)
+    assert (helped.returncode, "--checkpoint" in helped.stdout) == (0, True)

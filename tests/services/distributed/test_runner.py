@@ -1,0 +1,185 @@
+"""One experiment, two runners: in this process or on any number of Ray workers, the same bits come out."""
+
+import os
+import signal
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmil_core.outer_loop import groups
+from services.demonstrations.store import DemoStore
+from services.distributed.adaptation_worker import AdaptationWorker
+from services.distributed.chunking import PIECE, pack, unpack
+from services.distributed.learner import Learner
+from services.distributed.ray_meta_training import RayMetaTraining
+from services.distributed.runner import Runner
+from services.distributed.timing import Span, Timing
+from services.evaluation.results import EpisodeResult
+from services.experiments.experiment import Experiment, open_runner
+from tests.services.distributed.courses import ITERATIONS, Course, alone, assert_same_bits, follow, plan_of, training
+
+
+def cut(groups: int, size: int) -> list[slice]:
+    return [slice(first, first + size) for first in range(0, groups, size)]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("joined")
+@pytest.mark.parametrize(("slots", "group"), [(5, 1), (7, 3)])
+def test_any_number_of_workers_ends_with_the_same_bits(config, store: DemoStore, data, slots: int, group: int):
+    experiment = Experiment(training(config, slots, group), store)
+    wanted = alone(experiment, data)
+    assert np.isfinite(wanted.states[-1].parameters).all()
+    assert wanted.numbers == [state.iteration for state in wanted.states] == list(range(1, ITERATIONS + 1))
+    assert len(wanted.slots[0]) == slots
+    plan = plan_of(experiment, data)
+    with open_runner("ray", experiment.suite, 3) as runner:
+        whole = runner.meta_train(plan)
+        assert_same_bits(follow(whole), wanted)
+        whole.close()
+        for workers, fan_in in ((1, 8), (2, 2), (3, 4), (3, 2)):
+            meta_training = RayMetaTraining(plan, workers, fan_in)
+            assert_same_bits(follow(meta_training), wanted)
+            meta_training.close()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("joined")
+def test_neither_the_fan_in_nor_the_blocks_change_a_bit(
+    config, store: DemoStore, data, monkeypatch: pytest.MonkeyPatch
+):
+    experiment = Experiment(training(config, 11, 1), store)
+    wanted = alone(experiment, data)
+    all_groups = groups(experiment.config.training)
+    with open_runner("ray", experiment.suite, 2):
+        for fan_in, size in ((2, 1), (4, 1), (2, 2), (8, 4)):
+            monkeypatch.setattr(
+                RayMetaTraining, "blocks", [all_groups[part] for part in cut(len(all_groups), size)], raising=True
+            )
+            meta_training = RayMetaTraining(plan_of(experiment, data), 2, fan_in)
+            assert_same_bits(follow(meta_training), wanted)
+            meta_training.close()
+
+
+@pytest.mark.usefixtures("joined")
+def test_going_on_after_a_pause_changes_nothing(config, store: DemoStore, data):
+    experiment = Experiment(training(config, 5, 1), store)
+    wanted = alone(experiment, data)
+    with open_runner("ray", experiment.suite, 2) as runner:
+        meta_training = runner.meta_train(plan_of(experiment, data))
+        parts = [follow(meta_training, count) for count in (1, 0, ITERATIONS - 1)]
+    assert_same_bits(Course(*(list(chain(*lists)) for lists in zip(*parts, strict=True))), wanted)
+
+
+def test_the_groups_are_part_of_the_result(config, store: DemoStore, data):
+    """Else the tests above would show nothing: the order of addition matters to the last bits."""
+    found = []
+    for group in (1, 3):
+        experiment = Experiment(training(config, 7, group), store)
+        found.append(alone(experiment, data).states[-1].parameters)
+    assert not np.array_equal(*found)
+    assert np.allclose(*found, atol=1e-3)
+
+
+@pytest.mark.usefixtures("joined")
+@pytest.mark.parametrize(
+    ("where", "slots"), [("between two iterations", 5), ("gradient", 5), ("add", 5), ("gradient", 2), ("add", 2)]
+)
+def test_a_killed_worker_changes_nothing(
+    config, store: DemoStore, data, where: str, slots: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    experiment = Experiment(training(config, slots, 1), store)
+    wanted = alone(experiment, data)
+    note = tmp_path / "killed"
+
+    class Mortal(AdaptationWorker):
+        """One of them is killed in the middle of its work, in the third iteration."""
+
+        _iteration = 0
+
+        def gradient(self, parameters, iteration, tasks, block, before=()):
+            if where == "gradient" and iteration == 2:
+                self._die_once()
+            self._iteration = iteration
+            return super().gradient(parameters, iteration, tasks, block, before)
+
+        def add(self, *gradients):
+            if where == "add" and self._iteration >= 2:
+                self._die_once()
+            return super().add(*gradients)
+
+        def _die_once(self):
+            try:
+                note.touch(exist_ok=False)
+            except FileExistsError:
+                return
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def kill(done: int) -> None:
+        if where == "between two iterations" and done == 2:
+            assert isinstance(meta_training, RayMetaTraining)
+            meta_training._pool._workers[0].actor.__ray_call__.remote(lambda worker: worker._die_once())
+
+    monkeypatch.setattr("services.distributed.ray_meta_training.AdaptationWorker", Mortal)
+    with open_runner("ray", experiment.suite, 2) as runner:
+        meta_training = runner.meta_train(plan_of(experiment, data))
+        disturbed = follow(meta_training, disturb=kill)
+    assert note.exists()
+    assert isinstance(meta_training, RayMetaTraining)
+    assert meta_training.restarts == 1
+    assert_same_bits(disturbed, wanted)
+
+
+@pytest.mark.usefixtures("joined")
+@pytest.mark.parametrize("workers", [1, 3])
+def test_the_learner_receives_one_gradient(
+    config, store: DemoStore, data, workers: int, monkeypatch: pytest.MonkeyPatch
+):
+    class Strict(Learner):
+        def step(self, gradient):
+            assert [len(piece) for piece in gradient] == [len(piece) for piece in self.parameters()[1]]
+            return super().step(gradient)
+
+    monkeypatch.setattr("services.distributed.ray_meta_training.Learner", Strict)
+    experiment = Experiment(training(config, 9, 1), store)
+    with open_runner("ray", experiment.suite, workers):
+        meta_training = RayMetaTraining(plan_of(experiment, data), workers, fan_in=2)
+        assert follow(meta_training).numbers == list(range(1, ITERATIONS + 1))
+
+
+@pytest.mark.parametrize("size", [1, PIECE, PIECE + 1, 3 * PIECE])
+def test_what_is_packed_arrives_as_it_was(size: int):
+    vector = np.random.default_rng(0).normal(size=size).astype(np.float32)
+    packed = pack(vector)
+    assert all(len(piece) <= PIECE for piece in packed)
+    assert np.array_equal(unpack(packed), vector)
+    assert not any(np.shares_memory(piece, unpack(packed)) for piece in packed)
+
+
+def test_the_time_of_an_iteration_is_divided_up_whole():
+    work = {0: [Span(11, 13), Span(13.5, 15)], 4: [Span(12, 14)]}
+    timing = Timing.of(10, work, Span(17, 18))
+    assert timing == Timing(broadcast=1.5, compute=2.75, waiting=0.75, reduction=2, step=1)
+    assert timing.iteration == 8
+    assert timing.overhead_share == 1 - 3.75 / 8
+
+
+def episodes_of(runner: Runner, experiment: Experiment, data, checkpoint, folder: Path) -> list[EpisodeResult]:
+    folder.mkdir()
+    found = experiment.evaluate(runner, data, checkpoint, folder)
+    written = [EpisodeResult.model_validate_json(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
+    assert written == found.episodes
+    return written
+
+
+@pytest.mark.usefixtures("joined")
+def test_the_rows_of_an_evaluation_do_not_depend_on_who_simulates(experiment, data, train, tmp_path: Path):
+    checkpoint = train("base", "--training.iterations", "2")
+    with open_runner("local", experiment.suite, None) as runner:
+        local = episodes_of(runner, experiment, data, checkpoint, tmp_path / "local")
+    with open_runner("ray", experiment.suite, 2) as runner:
+        assert episodes_of(runner, experiment, data, checkpoint, tmp_path / "ray") == local
+    settings = experiment.config.evaluation
+    assert len(local) == len(experiment.tasks) * len(settings.shots) * settings.episodes

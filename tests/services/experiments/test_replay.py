@@ -1,0 +1,84 @@
+"""An episode follows from its row: it comes out again to the bit, or it is said why it cannot."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.evaluation.results import EpisodeResult, write_rows
+from services.experiments.finished_run import FinishedRun
+from services.experiments.replay import Replay, ReplayError, replaying
+from services.rollouts.recording import Film
+from services.suites.rendering import RenderingError
+
+
+@pytest.fixture
+def told_otherwise(finished: FinishedRun, tmp_path: Path):
+    """Return the run with other rows: those of the first trial, changed."""
+
+    def change(**values: object) -> tuple[FinishedRun, EpisodeResult]:
+        folder = tmp_path / "changed"
+        shutil.copytree(finished.folder, folder)
+        rows = [row.model_copy(update=values) for row in finished.episodes[:2]]
+        write_rows(folder / "episodes.jsonl", rows)
+        return FinishedRun(folder), rows[0]
+
+    return change
+
+
+def test_episodes_come_out_as_their_rows_say(finished: FinishedRun):
+    rows = [row for row in finished.episodes if row.task in {"reach", "door-close"}]
+    by_trial = {(row.split, row.task, row.shots, row.draw): row for row in rows}
+    with replaying(finished) as replay:
+        seen = [one for row in by_trial.values() for one in replay.trial(row)]
+    assert [one.row for one in seen] == rows
+    assert [one.difference for one in seen] == [None] * len(seen)
+    for one in seen:
+        assert len(one.footage.actions) == one.row.steps
+        assert one.watched.episode.seed == one.row.seed
+
+
+def test_what_comes_out_otherwise_is_named(told_otherwise):
+    run, row = told_otherwise(steps=299, success=True)
+    with replaying(run) as replay:
+        first, _ = replay.trial(row)
+    assert first.difference is not None
+    assert first.difference.startswith(f"episode 0 of {row.task}, 1-shot: success False, where the run had True")
+
+
+def test_only_what_is_to_be_filmed_is_filmed(finished: FinishedRun):
+    row, film = finished.episodes[0], Film(finished.experiment.suite.camera, 100, 48, 64)  # type: ignore[attr-defined]
+    with replaying(finished) as replay:
+        try:
+            filmed, unfilmed = replay.trial(row, film, [row.episode])
+        except RenderingError as error:
+            pytest.skip(str(error))
+    assert [frame.step for frame in filmed.footage.frames][:2] == [0, 100]
+    assert unfilmed.footage.frames == []
+
+
+def test_its_demonstration_is_the_one_that_was_adapted_to(finished: FinishedRun):
+    row, film = finished.episodes[0], Film(finished.experiment.suite.camera, 100, 48, 64)  # type: ignore[attr-defined]
+    with replaying(finished) as replay:
+        try:
+            demonstration, footage = replay.demonstration(row, film)
+        except RenderingError as error:
+            pytest.skip(str(error))
+    assert demonstration.id == row.support[0]
+    assert len(footage.actions) == len(demonstration)
+    noise = footage.actions - demonstration.actions
+    assert 0.01 < np.abs(noise).mean() < 0.2, "what is stored is without the noise of what was executed"
+
+
+@pytest.mark.parametrize(
+    ("field", "wrong", "words"),
+    [
+        ("checkpoint", "f" * 64, "the episodes are of ffffffffffff; evaluate the run's end"),
+        ("data", "e" * 64, "got demonstrations with the SHA-256"),
+    ],
+)
+def test_an_episode_of_something_else_is_refused(told_otherwise, field: str, wrong: str, words: str):
+    run, row = told_otherwise(**{field: wrong})
+    with pytest.raises(ReplayError, match=words):
+        Replay(run).trial(row)

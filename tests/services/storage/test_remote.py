@@ -1,0 +1,197 @@
+"""Storages that all machines reach: a folder, and a real S3 server on loopback."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import fsspec
+import numpy as np
+import pytest
+
+from dmil_core.configs import PRESETS
+from services import meta_train
+from services.demonstrations.store import DemoStore, open_store
+from services.experiments.experiment import Experiment, open_runner
+from services.storage.checkpoints import FILES, SEAL, Checkpoint, CheckpointError, Checkpoints
+from services.storage.remote import STORAGE, Storage, StorageError, TroubleError
+from services.storage.replication import Replica, replicated
+
+S3 = {"AWS_ACCESS_KEY_ID": "any", "AWS_SECRET_ACCESS_KEY": "any", "AWS_DEFAULT_REGION": "us-east-1"}
+
+
+@pytest.fixture(scope="module")
+def server(free_port: Callable[[], int], answers, wait_for, tmp_path_factory) -> Iterator[str]:
+    """The address of an S3 server, empty at first."""
+    port = free_port()
+    command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
+    with (tmp_path_factory.mktemp("s3") / "log").open("w") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=log)
+    wait_for(lambda: answers(f"http://127.0.0.1:{port}"), "the S3 server")
+    yield f"http://127.0.0.1:{port}"
+    process.terminate()
+    process.wait(10)
+
+
+@pytest.fixture(params=["file", "s3"])
+def url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A storage of each kind, which programs are told of too."""
+    if request.param == "file":
+        url = (tmp_path / "storage").as_uri()
+    else:
+        for name, value in {**S3, "AWS_ENDPOINT_URL": request.getfixturevalue("server")}.items():
+            monkeypatch.setenv(name, value)
+        url = f"s3://bucket-{os.urandom(4).hex()}/lab"
+        files, _ = fsspec.core.url_to_fs(url)
+        files.mkdir(url.split("/")[2])
+    monkeypatch.setenv(STORAGE, url)
+    yield url
+    fsspec.filesystem(request.param).clear_instance_cache()
+
+
+def names(storage: Storage) -> set[str]:
+    """Return the seals that are there."""
+    return set(storage.sealed("runs/run/checkpoints", SEAL, r"iteration-\d+"))
+
+
+def test_a_sealed_folder_is_whole_or_not_there(url: str, tmp_path: Path):
+    storage = Storage(url)
+    assert storage.get("a/b", 10) is None
+    assert storage.sealed("a", "seal", ".*") == {}
+    storage.put_sealed("a/b", {"seal": b"s", "one": b"1", "deep/two": b"22"}, "seal")
+    assert storage.sealed("a", "seal", ".*") == {"b": b"s"}
+    assert storage.sealed("a", "seal", "c") == {}
+    assert storage.get_sealed("a/b", tmp_path / "here", {"one": 1, "deep/two": 2}, "seal")
+    assert (tmp_path / "here" / "deep" / "two").read_bytes() == b"22"
+    with pytest.raises(TroubleError, match="got 2 bytes; wanted at most 1"):
+        storage.get_sealed("a/b", tmp_path / "other", {"deep/two": 1}, "seal")
+    with pytest.raises(TroubleError, match="three: got nothing"):
+        storage.get_sealed("a/b", tmp_path / "other", {"three": 1}, "seal")
+    assert {path.name for path in tmp_path.iterdir()} <= {"here", "storage"}
+    storage.put("a/c/one", b"unsealed")
+    assert not storage.get_sealed("a/c", tmp_path / "other", {"one": 10}, "seal")
+    assert storage.sealed("a", "seal", ".*") == {"b": b"s"}
+    storage.remove("a/b", "seal")
+    storage.remove("a/never", "seal")
+    assert storage.sealed("a", "seal", ".*") == {}
+
+
+def test_a_run_goes_on_elsewhere_to_the_same_bits(url: str, train, workplace: Path, monkeypatch, capsys):
+    whole = train("whole", "--training.iterations", "8", "--training.checkpoint-every", "2")
+    train("run", "--training.iterations", "6", "--training.checkpoint-every", "2", "--training.checkpoints-kept", "1")
+    local = {path.name for path in (workplace / "runs" / "run" / "checkpoints").iterdir()}
+    assert names(Storage(url)) == local
+    shutil.rmtree(workplace / "runs" / "run")
+    capsys.readouterr()
+    resumed = train("run", "--training.iterations", "8", resume=True)
+    assert f"fetched from {url}" in capsys.readouterr().out
+    np.testing.assert_array_equal(resumed.state.parameters, whole.state.parameters)
+    assert "iteration-0000008" in names(Storage(url))
+    summary = Storage(url).get("runs/run/summary.json", 10**6)
+    assert summary == (workplace / "runs" / "run" / "summary.json").read_bytes()
+
+
+def test_a_run_whose_folder_is_as_far_is_left_alone(url: str, train, workplace: Path, capsys):
+    train("run", "--training.iterations", "2")
+    capsys.readouterr()
+    train("run", "--training.iterations", "3", resume=True)
+    assert "fetched" not in capsys.readouterr().out
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from services.storage.replication import Replica
+from services.storage.remote import Storage
+
+class Dying(Storage):
+    left = int(sys.argv[3])
+    def put(self, name, content):
+        if self.left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        self.left -= 1
+        super().put(name, content)
+
+Replica(Path(sys.argv[1]), Dying(sys.argv[2])).copy()
+"""
+
+
+@pytest.mark.parametrize("parts", [0, 1, 4, 5, 7, 9])
+def test_killed_between_parts_it_leaves_whole_checkpoints_only(url: str, train, workplace: Path, parts: int):
+    """Two checkpoints of five parts each: whoever resumes gets the newest that is whole, and the next copy is whole."""
+    del os.environ[STORAGE]
+    train("run", "--training.iterations", "4", "--training.checkpoint-every", "2")
+    folder, storage = workplace / "runs" / "run", Storage(url)
+    first, second = sorted(path.name for path in (folder / "checkpoints").iterdir())
+    killed = subprocess.run([sys.executable, "-c", KILLED, str(folder), url, str(parts)], timeout=60)
+    assert killed.returncode == -signal.SIGKILL
+    assert names(storage) == set([first, second][: parts // 5])
+    elsewhere = workplace / "elsewhere" / "run"
+    assert not Replica(elsewhere, storage).restore()  # the settings come last of all
+    Replica(folder, storage).copy()
+    assert names(storage) == {first, second}
+    assert Replica(elsewhere, storage).restore()
+    found = Checkpoints(elsewhere / "checkpoints", kept=1).newest()
+    assert found.digest == Checkpoint(folder / "checkpoints" / second).digest
+
+
+def test_what_was_changed_in_the_storage_is_refused_by_name(url: str, train, workplace: Path):
+    train("run", "--training.iterations", "2")
+    storage, elsewhere = Storage(url), workplace / "elsewhere" / "run"
+    name = max(names(storage))
+    storage.put(f"runs/run/checkpoints/{name}/parameters.safetensors", b"other")
+    assert Replica(elsewhere, storage).restore()
+    with pytest.raises(CheckpointError, match=r"parameters\.safetensors: got 5 bytes"):
+        Checkpoint(elsewhere / "checkpoints" / name)
+    assert set(FILES) < {path.name for path in (elsewhere / "checkpoints" / name).iterdir()}
+
+
+def test_demonstrations_are_fetched_in_place_of_collected_anew(
+    url: str, store: DemoStore, workplace: Path, monkeypatch
+):
+    experiment = Experiment(PRESETS["ml10-smoke"], store)
+
+    def collected(root: str) -> dict[str, str]:
+        monkeypatch.setenv("DMIL_DATA", str(workplace / root))
+        with open_runner("local", experiment.suite, None) as runner:
+            found = Experiment(experiment.config, open_store()).collect(runner)
+        return {task: dataset.digest for task, dataset in found.items()}
+
+    first = collected("one")
+    began = time.time()
+    assert collected("two") == first
+    arrays = list((workplace / "two").rglob("main_data.hdf5"))
+    assert len(arrays) == len(first)
+    originals = {path.relative_to(workplace / "one"): path.read_bytes() for path in (workplace / "one").rglob("*.hdf5")}
+    fetched = {path.relative_to(workplace / "two"): path.read_bytes() for path in arrays}
+    assert fetched == originals  # HDF5 has times in it: the same bytes were not made twice
+    assert all(path.stat().st_mtime >= began - 1 for path in arrays)
+
+
+def test_a_storage_that_is_away_is_told_once_and_stops_nothing(workplace: Path, monkeypatch, free_port, train, capsys):
+    for name, value in {**S3, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{free_port()}", "AWS_MAX_ATTEMPTS": "1"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv(STORAGE, "s3://bucket/lab")
+    train("run", "--training.iterations", "2")
+    said = capsys.readouterr().out
+    assert "s3://bucket/lab does not take the copy of" in said
+    assert "has no whole copy of" in said
+    assert (workplace / "runs" / "run" / "summary.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("url", "told"),
+    [
+        ("nothing://bucket", "DMIL_STORAGE: got nothing://bucket"),
+        ("gs://bucket/lab", "pip install gcsfs"),
+    ],
+)
+def test_a_url_that_names_no_storage_is_a_mistake(url: str, told: str, monkeypatch, workplace: Path, complaint):
+    monkeypatch.setenv(STORAGE, url)
+    with pytest.raises(StorageError), replicated(workplace / "run", print):
+        pass
+    assert told in complaint(meta_train.run, "--preset", "ml10-smoke", "--runner", "local")
