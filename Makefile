@@ -37,6 +37,7 @@ test: setup ## lint, format, types, then every test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
+	$(BIN)/lint-imports
 	$(BIN)/python -m pytest --ignore tests/deploy -m "not alone" -n 2 --dist loadfile --durations 10
 	$(BIN)/python -m pytest --ignore tests/deploy -m alone --durations 20
 

@@ -28,8 +28,6 @@ from dmil_core.seeding import stream
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 
-__all__ = ["Arguments", "run"]
-
 CALLS = 200
 """Actions are timed by the hundred: one alone is too short."""
 

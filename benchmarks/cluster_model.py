@@ -3,8 +3,6 @@
 import math
 from typing import NamedTuple
 
-__all__ = ["Costs", "Network", "Prediction", "calls_of_a_tree", "predict", "seconds_of_a_tree"]
-
 
 class Costs(NamedTuple):
     """What was measured on one machine."""

@@ -31,8 +31,6 @@ from services.cli.arguments import exit_code, parse
 from services.cli.progress import Bar, console
 from services.storage.files import write_file
 
-__all__ = ["Arguments", "run"]
-
 VICTIMS = {"worker": 7, "all workers": 1, "learner": 2, "driver": 1}
 """What is killed, and how often against the others."""
 KILLS_PER_RUN = 10

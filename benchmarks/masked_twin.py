@@ -15,8 +15,6 @@ from dmil_core.dmil_config import DmilConfig
 from dmil_core.losses import Steps
 from dmil_core.networks import Parameters, flatten
 
-__all__ = ["MaskedTwin", "Sets"]
-
 Sets: TypeAlias = tuple[Steps, Steps, Steps, Steps]
 """τ1 to τ4 of one task."""
 

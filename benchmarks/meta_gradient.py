@@ -30,8 +30,6 @@ from dmil_core.meta_gradient import task_gradient
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import Bar, console
 
-__all__ = ["Arguments", "run"]
-
 WORKERS = 2
 TASKS = {"paper": 2, "quick": 10}
 """Tasks in a batch; a worker computes an equal share of them."""

@@ -4,9 +4,9 @@ Demonstrations are made up, in the shape of Meta-World's: 39-dimensional observa
 100 steps, five slots a group. The local runner, one worker and two take turns, and medians over all iterations are
 given.
 
-The seconds of an iteration are divided up whole, see `services.distributed.timing.Timing`. The overhead's share is what is
-left of the iteration beside an ideal one: 1 - (worker compute seconds / workers + step seconds) / iteration seconds. So
-waiting for the slower worker counts as overhead too.
+The seconds of an iteration are divided up whole, see `services.distributed.timing.Timing`. The share of the overhead
+is what is left of the iteration beside an ideal one: 1 - (worker compute seconds / workers + step seconds) / iteration
+seconds. So waiting for the slower worker counts as overhead too.
 """
 
 import os
@@ -31,8 +31,6 @@ from services.distributed.ray_runner import RayRunner
 from services.distributed.runner import LocalMetaTraining, MetaTraining
 from services.distributed.timing import Timing
 from services.suites.metaworld import MetaWorldSuite
-
-__all__ = ["Arguments", "run"]
 
 WORKERS = (1, 2)
 

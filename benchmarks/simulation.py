@@ -39,10 +39,9 @@ from dmil_core.seeding import stream
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.distributed.simulation_worker import SimulationWorker
-from services.rollouts.trials import TrialOutcome, demonstrate, trials
+from services.rollouts.episodes import demonstrate
+from services.rollouts.trials import TrialOutcome, trials
 from services.suites.metaworld import SPLITS, MetaWorldSuite, SeededEpisodes
-
-__all__ = ["Arguments", "run"]
 
 mujoco: Any = compiled_mujoco  # compiled, so a type checker sees nothing of it
 

@@ -33,8 +33,6 @@ from services.distributed.ray_runner import RayRunner
 from services.distributed.runner import Plan
 from services.suites.metaworld import MetaWorldSuite
 
-__all__ = ["Arguments", "run"]
-
 CALLS = 200
 """That the cost of one is the mean of."""
 

@@ -6,8 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-__all__ = ["alternate", "write_rows"]
-
 
 def alternate(
     functions: Mapping[str, Callable[[], object]],

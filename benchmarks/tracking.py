@@ -31,8 +31,6 @@ from services.tracking import Tracker
 from services.tracking.delivery import Identity
 from services.tracking.spool import read_spool
 
-__all__ = ["Arguments", "run"]
-
 DELAY = 10.0
 """Seconds that the slow server waits before each answer."""
 LEAST = 0.95

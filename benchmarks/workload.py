@@ -17,18 +17,6 @@ from dmil_core.seeding import stream
 from services.distributed.runner import Plan
 from services.suites.metaworld import MetaWorldSuite
 
-__all__ = [
-    "ACTION_DIM",
-    "OBS_DIM",
-    "Size",
-    "as_in_a_run",
-    "draw_parameters",
-    "draw_sets",
-    "draw_steps",
-    "made_up_plan",
-    "settings",
-]
-
 OBS_DIM, ACTION_DIM = 39, 4
 Size: TypeAlias = Literal["paper", "quick"]
 TRAJECTORY_STEPS = {"paper": 100, "quick": 24}

@@ -21,21 +21,6 @@ from dmil_core.losses import (
 from dmil_core.networks import Network, Parameters, bank, mlp, network, own_states, stacked
 from dmil_core.slopes import Slope, slope
 
-__all__ = [
-    "Adapted",
-    "Hierarchy",
-    "InnerStep",
-    "act",
-    "adapt",
-    "choose",
-    "errors_of",
-    "high_level_slope",
-    "inner_loop",
-    "label",
-    "sub_skill_slopes",
-    "targets_of",
-]
-
 
 class Hierarchy(NamedTuple):
     """The networks of both levels."""

@@ -9,19 +9,6 @@ from dmil_core.dmil_config import DmilConfig
 from dmil_core.methods.registry import config_type
 from dmil_core.settings import Count, MethodConfig, NotNegative, Positive, Seed, Settings, Size
 
-__all__ = [
-    "DEFAULT_METHOD",
-    "PRESETS",
-    "SIZES",
-    "DemonstrationConfig",
-    "EvaluationConfig",
-    "ExperimentConfig",
-    "SuiteConfig",
-    "SuiteName",
-    "TrainingConfig",
-    "preset_of",
-]
-
 SuiteName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]*$")]
 DEFAULT_METHOD = "dmil"
 

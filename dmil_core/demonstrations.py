@@ -10,8 +10,6 @@ from jaxtyping import Float32
 
 from dmil_core.errors import UserError
 
-__all__ = ["Demonstration", "DemonstrationError", "Standardisation", "TaskBatch", "digest", "sample_task_batch"]
-
 
 class DemonstrationError(UserError):
     """A demonstration, or a set of them, that cannot be learned from."""

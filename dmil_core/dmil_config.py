@@ -5,8 +5,6 @@ from typing import Any, ClassVar, Literal
 
 from dmil_core.settings import Count, HierarchicalConfig, NotNegative, Positive, Size
 
-__all__ = ["DmilConfig"]
-
 
 class DmilConfig(HierarchicalConfig):
     """Dual Meta Imitation Learning."""

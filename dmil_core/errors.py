@@ -7,8 +7,6 @@ from contextlib import contextmanager
 
 from pydantic import ValidationError
 
-__all__ = ["RunError", "UserError", "WorkError", "explain", "piece_of_work", "shown"]
-
 MOST_LINES = 10
 
 

@@ -11,21 +11,6 @@ from torch.nn import functional
 
 from dmil_core.demonstrations import Demonstration, Standardisation
 
-__all__ = [
-    "OutputLoss",
-    "Steps",
-    "Targets",
-    "behaviour_cloning_loss",
-    "continuity_loss",
-    "cross_entropy",
-    "differentiated",
-    "high_level_loss",
-    "soft_labels",
-    "squared_errors",
-    "sub_skill_labels",
-    "switching",
-]
-
 Targets: TypeAlias = Int[Tensor, " steps"] | Float[Tensor, "steps sub_skills"]
 """What the high level should predict at each step: a sub-skill, or a weight for each."""
 

@@ -22,8 +22,6 @@ from dmil_core.losses import Steps, continuity_loss, sub_skill_labels
 from dmil_core.networks import Parameters, unflatten
 from dmil_core.slopes import Slope
 
-__all__ = ["TaskGradient", "task_gradient", "tree_sum"]
-
 
 class TaskGradient(NamedTuple):
     """One task's contribution to the outer step, flat in the parameters' order, and what to show of it."""

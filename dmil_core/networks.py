@@ -13,23 +13,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-__all__ = [
-    "BLOCK",
-    "Layer",
-    "Network",
-    "Parameters",
-    "activations",
-    "bank",
-    "blocks",
-    "flatten",
-    "initialise",
-    "mlp",
-    "network",
-    "own_states",
-    "stacked",
-    "unflatten",
-]
-
 Parameters: TypeAlias = Mapping[str, Tensor]
 
 

@@ -17,20 +17,6 @@ from dmil_core.methods.base import MetaLearner, Policy, PractisingLearner, Rollo
 from dmil_core.networks import Parameters
 from dmil_core.seeding import stream, stream_seed
 
-__all__ = [
-    "GroupGradient",
-    "OuterState",
-    "OuterStep",
-    "Practise",
-    "SpoiltSlot",
-    "add",
-    "blocks",
-    "group_gradient",
-    "groups",
-    "slot_in_words",
-    "tasks_of",
-]
-
 BLOCKS_PER_WORKER = 4
 """Blocks that each worker should find at least, so that a slow one takes fewer and the others do not wait."""
 

@@ -8,8 +8,6 @@ import hashlib
 
 import numpy as np
 
-__all__ = ["stream", "stream_seed"]
-
 
 def stream(seed: int, *name: str | int) -> np.random.Generator:
     """Return the random generator that belongs to `name` under the experiment's `seed`."""

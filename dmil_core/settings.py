@@ -5,19 +5,6 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = [
-    "Count",
-    "HierarchicalConfig",
-    "MethodConfig",
-    "NotNegative",
-    "Positive",
-    "Probability",
-    "Seed",
-    "Settings",
-    "Size",
-    "sub_skills_of",
-]
-
 Count = Annotated[int, Field(ge=1, le=10**9)]
 Size = Annotated[int, Field(ge=1, le=10_000)]
 """A count of what is held in memory together."""

@@ -16,8 +16,6 @@ from torch import Tensor
 from dmil_core.losses import OutputLoss
 from dmil_core.networks import Layer, Network, activations, blocks
 
-__all__ = ["Slope", "slope"]
-
 _relu_backward = torch.ops.aten.threshold_backward.grad_input
 
 

@@ -7,19 +7,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import binomtest, entropy, t, trim_mean
 
-__all__ = [
-    "Interval",
-    "MeanScore",
-    "Rate",
-    "interquartile_mean",
-    "mean_score",
-    "performance_profile",
-    "profile_band",
-    "share_entropy",
-    "stratified_bootstrap",
-    "success_rate",
-]
-
 
 class Rate(NamedTuple):
     """A success rate with its denominator and interval, all as fractions of one."""

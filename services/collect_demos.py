@@ -17,12 +17,11 @@ from rich.table import Table
 
 from dmil_core.configs import ExperimentConfig
 from services import inspect_demos, record_demos, verify_experts
-from services.cli.arguments import DEFAULT_PRESET, Quiet, defaults_from, exit_code, parse
+from services.cli.arguments import Quiet, exit_code, parse
+from services.cli.composition import DEFAULT_PRESET, defaults_from
 from services.cli.progress import Clock, console
 from services.demonstrations.store import TaskDemonstrations, open_store
 from services.experiments.experiment import Experiment, RunnerKind, open_runner
-
-__all__ = ["Arguments", "run"]
 
 
 @dataclass(frozen=True)

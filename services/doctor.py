@@ -23,8 +23,6 @@ from services.distributed.node_info import NodeFacts, cluster_facts, facts
 from services.storage.files import DiskFullError, write_file
 from services.tracking import in_words, redacted, tracking_uri
 
-__all__ = ["Arguments", "Finding", "examine", "run"]
-
 Verdict = Literal["good", "warning", "bad"]
 DISK_BYTES = 2 * 10**9
 """A run at paper size keeps some hundred MB of checkpoints, ML45's demonstrations take as much."""

@@ -11,16 +11,15 @@ from pathlib import Path
 import tyro
 
 from dmil_core.configs import EvaluationConfig
-from services.cli.arguments import ConfigError, Quiet, exit_code, parse, peek, with_evaluation
+from services.cli.arguments import ConfigError, Quiet, exit_code, parse, peek
+from services.cli.composition import with_evaluation
 from services.cli.progress import Clock, console
 from services.demonstrations.store import open_store
 from services.evaluation.summary import summarise
 from services.experiments.champions import ALIAS, open_contest
 from services.experiments.experiment import Experiment, RunnerKind, open_runner
-from services.report import show, write_report
+from services.reporting.end_of_run import show, write_report
 from services.storage.checkpoints import Checkpoint, Checkpoints
-
-__all__ = ["Arguments", "run"]
 
 
 @dataclass(frozen=True)

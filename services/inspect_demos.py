@@ -11,13 +11,12 @@ import tyro
 from rich.table import Table
 
 from dmil_core.demonstrations import Demonstration, DemonstrationError
-from services.cli.arguments import exit_code, parse, suite_settings
+from services.cli.arguments import exit_code, parse
+from services.cli.composition import suite_settings
 from services.cli.progress import Bar, console
 from services.demonstrations.external import FORMS, Recording, misfits, read_recordings
 from services.suites.base import TaskSuite
 from services.suites.registry import open_suite
-
-__all__ = ["Arguments", "run"]
 
 SUFFIXES = {".npz": "npz", ".hdf5": "hdf5", ".h5": "hdf5"}
 

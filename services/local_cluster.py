@@ -27,8 +27,6 @@ from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.storage.files import read_file, write_file
 
-__all__ = ["Arguments", "ClusterError", "Record", "StartError", "run"]
-
 SECONDS_TO_START = 120.0
 SECONDS_TO_STOP = 20.0
 SECONDS_FOR_A_JOB = 60

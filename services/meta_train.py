@@ -17,13 +17,14 @@ from pydantic import ValidationError
 
 from dmil_core.configs import DEFAULT_METHOD, ExperimentConfig
 from dmil_core.errors import explain
-from services.cli.arguments import DEFAULT_PRESET, ConfigError, Quiet, defaults_from, exit_code, parse, peek
+from services.cli.arguments import ConfigError, Quiet, exit_code, parse, peek
+from services.cli.composition import DEFAULT_PRESET, defaults_from
 from services.cli.progress import Clock, console
 from services.demonstrations.store import open_store
 from services.evaluation.summary import summarise
 from services.experiments.experiment import Experiment, OnNonfinite, RunnerKind, open_runner
 from services.experiments.finished_run import FinishedRun
-from services.report import PAGE, publish, show, write_report
+from services.reporting.end_of_run import PAGE, publish, show, write_report
 from services.storage.checkpoints import Checkpoint, Checkpoints
 from services.storage.files import read_file, write_file
 from services.storage.remote import STORAGE
@@ -31,8 +32,6 @@ from services.storage.replication import replicated, restored
 from services.storage.run_folders import find_folder, new_folder
 from services.tracking import Tracker, introduce
 from services.tracking.system import recording_system
-
-__all__ = ["Arguments", "run"]
 
 CHANGEABLE = {"iterations", "checkpoint_every", "checkpoints_kept"}
 """Settings of meta-training that a resumed run may change without becoming another run."""

@@ -9,14 +9,13 @@ import numpy as np
 import tyro
 
 from dmil_core.demonstrations import Demonstration
-from services.cli.arguments import ConfigError, exit_code, parse, suite_settings
+from services.cli.arguments import ConfigError, exit_code, parse
+from services.cli.composition import suite_settings
 from services.cli.progress import console
 from services.demonstrations.external import FORMS, demonstrations
 from services.demonstrations.store import open_store
 from services.suites.base import Attempt
 from services.suites.registry import open_suite
-
-__all__ = ["Arguments", "run"]
 
 MOST = 10_000
 """Demonstrations that are read, as many as an experiment may ask for."""

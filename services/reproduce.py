@@ -21,8 +21,6 @@ from services.distributed.simulation_worker import SimulationWorker
 from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoint
 
-__all__ = ["Arguments", "run"]
-
 
 @dataclass(frozen=True)
 class Arguments:

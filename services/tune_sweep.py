@@ -34,8 +34,6 @@ from services.tracking.delivery import IDENTITY, Identity
 from services.tracking.links import comparison_link
 from services.tracking.system import recording_system
 
-__all__ = ["Arguments", "run"]
-
 CONFIGS = Path(__file__).parents[1] / "tune_configs"
 
 

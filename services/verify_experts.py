@@ -9,14 +9,13 @@ from rich.table import Table
 
 from dmil_core.errors import RunError, WorkError
 from dmil_core.statistics import success_rate
-from services.cli.arguments import ConfigError, Quiet, exit_code, parse, suite_settings
+from services.cli.arguments import ConfigError, Quiet, exit_code, parse
+from services.cli.composition import suite_settings
 from services.cli.progress import Bar, console
 from services.experiments.experiment import RunnerKind, open_runner
 from services.rollouts.verification import VerificationRow
 from services.suites.base import TaskSuite
 from services.suites.registry import open_suite
-
-__all__ = ["Arguments", "run"]
 
 CHUNK = 5
 """Seeds in one call to a simulation worker."""

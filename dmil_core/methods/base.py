@@ -24,21 +24,6 @@ from dmil_core.meta_gradient import TaskGradient
 from dmil_core.networks import Parameters
 from dmil_core.settings import MethodConfig
 
-__all__ = [
-    "Decision",
-    "Drawn",
-    "FineTuning",
-    "Flat",
-    "Memoryless",
-    "MetaLearner",
-    "Method",
-    "Policy",
-    "PractisingLearner",
-    "Rollout",
-    "Standardised",
-    "SubSkillUse",
-]
-
 
 @runtime_checkable
 class Drawn(Protocol):

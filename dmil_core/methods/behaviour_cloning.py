@@ -27,8 +27,6 @@ from dmil_core.networks import Layer, Network, Parameters, initialise, mlp, netw
 from dmil_core.settings import Count, MethodConfig, Positive, Size
 from dmil_core.slopes import slope
 
-__all__ = ["BehaviourCloning", "BehaviourCloningConfig", "NetworkPolicy", "PerTask", "PerTaskConfig", "fine_tuned"]
-
 PREFIX = "policy"
 
 

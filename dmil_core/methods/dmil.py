@@ -24,8 +24,6 @@ from dmil_core.meta_gradient import TaskGradient
 from dmil_core.methods.base import Decision, FineTuning, Memoryless, Standardised, SubSkillUse
 from dmil_core.networks import Parameters, initialise
 
-__all__ = ["Dmil", "DmilPolicy"]
-
 
 @dataclass(frozen=True)
 class DmilPolicy(Memoryless):

@@ -6,8 +6,6 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-__all__ = ["MacroSteps", "draw_batch", "macro_steps"]
-
 
 class MacroSteps(NamedTuple):
     """How the steps of trajectories are cut into macro-steps."""

@@ -49,8 +49,6 @@ from dmil_core.methods.mil_learning import Pairs, Support, adapted, outer_gradie
 from dmil_core.methods.transformer import Cache, Sizes, cached, decode, encode
 from dmil_core.networks import Parameters
 
-__all__ = ["Mil", "MilBatch", "MilConfig", "MilPolicy"]
-
 
 @dataclass(frozen=True, eq=False)
 class MilBatch:

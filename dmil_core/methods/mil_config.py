@@ -5,8 +5,6 @@ from typing import Any, ClassVar, Literal
 
 from dmil_core.settings import MethodConfig, Positive, Probability, Size
 
-__all__ = ["MilConfig"]
-
 
 class MilConfig(MethodConfig):
     """Meta imitation learning with a transformer."""

@@ -16,18 +16,6 @@ from dmil_core.methods.mil_config import MilConfig
 from dmil_core.methods.transformer import Dropout, cached, decode, dropout, encode, no_dropout, position_encoding
 from dmil_core.networks import Parameters, flatten
 
-__all__ = [
-    "Adapted",
-    "HeldOut",
-    "Pairs",
-    "Support",
-    "adapted",
-    "held_out",
-    "inner_loss",
-    "outer_gradient",
-    "outer_loss",
-]
-
 
 class Pairs(NamedTuple):
     """State-action pairs of the query set."""

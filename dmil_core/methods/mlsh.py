@@ -52,8 +52,6 @@ from dmil_core.methods.ppo import clipped_surrogate, scaled, standardised, traje
 from dmil_core.networks import Layer, Network, Parameters, bank, flatten, initialise, mlp, network, own_states
 from dmil_core.seeding import stream
 
-__all__ = ["Mlsh", "MlshBatch", "MlshPolicy"]
-
 FRESH_SCALE = 0.01
 """Scale of a fresh high level's last layer, against He's."""
 

@@ -5,8 +5,6 @@ from typing import Any, ClassVar, Literal
 
 from dmil_core.settings import Count, HierarchicalConfig, NotNegative, Positive, Probability, Size
 
-__all__ = ["MlshConfig"]
-
 
 class MlshConfig(HierarchicalConfig):
     """Meta Learning Shared Hierarchies, behaviour-cloning variant."""

@@ -20,8 +20,6 @@ from dmil_core.methods.base import Decision, FineTuning, Flat, Standardised
 from dmil_core.networks import Parameters
 from dmil_core.settings import MethodConfig
 
-__all__ = ["NearestNeighbour", "NearestNeighbourConfig", "NearestNeighbourPolicy"]
-
 
 class NearestNeighbourConfig(MethodConfig):
     """The action of the support set's nearest state."""

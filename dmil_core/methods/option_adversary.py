@@ -21,23 +21,6 @@ from dmil_core.methods.options import OptionModel, options_before
 from dmil_core.methods.ppo import clipped_surrogate, generalised_advantages
 from dmil_core.networks import Parameters, mlp, network
 
-__all__ = [
-    "POLICY",
-    "Aims",
-    "Played",
-    "aims_of",
-    "decisions",
-    "discriminate",
-    "discriminator_logits",
-    "discriminator_loss",
-    "high_values",
-    "imitation_rewards",
-    "improve",
-    "low_values",
-    "named",
-    "orthogonal",
-]
-
 POLICY = ("high.", "low.", "log_deviations")
 """What the names of the option model's parameters begin with."""
 

@@ -63,8 +63,6 @@ from dmil_core.methods.option_policies import OptionExplorer, OptionPolicy
 from dmil_core.methods.options import Chain, OptionModel, pairs_of, posterior, viterbi, weighted_log_likelihood
 from dmil_core.networks import Parameters, flatten, initialise
 
-__all__ = ["OptionGail", "OptionGailConfig", "OptionGailOffline", "OptionGailOfflineConfig", "OptionMaterial"]
-
 Phase = Literal["likelihood", "hard", "adversarial"]
 
 

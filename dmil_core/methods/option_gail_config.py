@@ -7,8 +7,6 @@ from pydantic import Field
 
 from dmil_core.settings import Count, HierarchicalConfig, NotNegative, Positive, Probability, Size
 
-__all__ = ["OptionConfig", "OptionGailConfig", "OptionGailOfflineConfig"]
-
 Iterations = Annotated[int, Field(ge=0, le=10**9)]
 
 

@@ -12,8 +12,6 @@ from dmil_core.losses import Steps
 from dmil_core.methods.base import Decision, SubSkillUse
 from dmil_core.methods.options import OptionModel
 
-__all__ = ["OptionExplorer", "OptionPolicy"]
-
 
 @dataclass(frozen=True)
 class OptionPolicy:

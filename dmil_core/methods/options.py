@@ -18,17 +18,6 @@ from torch.nn import functional
 
 from dmil_core.networks import Network, Parameters, bank, mlp, network, own_states
 
-__all__ = [
-    "Chain",
-    "OptionModel",
-    "log_likelihood",
-    "options_before",
-    "pairs_of",
-    "posterior",
-    "viterbi",
-    "weighted_log_likelihood",
-]
-
 LARGEST_LOG_DEVIATION = 0.0
 """Of the original, as its least: −20."""
 

@@ -63,8 +63,6 @@ from dmil_core.methods.pemirl_losses import BOUND, Transitions, infer, losses_of
 from dmil_core.networks import Layer, Parameters, flatten, initialise, network
 from dmil_core.settings import Count, MethodConfig, NotNegative, Positive, Size
 
-__all__ = ["ContextBatch", "Pemirl", "PemirlConfig"]
-
 
 class PemirlConfig(MethodConfig):
     """PEMIRL, behaviour-cloning variant."""

@@ -17,20 +17,6 @@ from dmil_core.demonstrations import Demonstration, Standardisation
 from dmil_core.losses import Steps
 from dmil_core.networks import Parameters, mlp, network
 
-__all__ = [
-    "BOUND",
-    "Gaussian",
-    "Losses",
-    "Transitions",
-    "action_distribution",
-    "discriminator_loss",
-    "infer",
-    "information_surrogate",
-    "log_reward",
-    "losses_of",
-    "policy_surrogate",
-]
-
 BOUND = 5.0
 """No |log σ| is larger: e⁻⁵ is far below any action's noise."""
 

@@ -11,8 +11,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-__all__ = ["clipped_surrogate", "generalised_advantages", "scaled", "standardised", "trajectory_advantages"]
-
 SMALLEST = 1e-8
 """Stands in for a spread of zero."""
 

@@ -14,8 +14,6 @@ from dmil_core.methods.option_gail import OptionGail, OptionGailOffline
 from dmil_core.methods.pemirl import Pemirl
 from dmil_core.settings import MethodConfig
 
-__all__ = ["ENTRY_POINTS", "MethodError", "config_type", "method_names", "method_type"]
-
 ENTRY_POINTS = "dmil.methods"
 """The group of entry points in which a package registers a method, see `Standardised`."""
 OURS: dict[str, type[Standardised[Any]]] = {

@@ -24,20 +24,6 @@ from torch.nn import functional
 
 from dmil_core.networks import Parameters
 
-__all__ = [
-    "Cache",
-    "Dropout",
-    "Sizes",
-    "attention",
-    "cached",
-    "decode",
-    "dropout",
-    "encode",
-    "initialise",
-    "no_dropout",
-    "position_encoding",
-]
-
 Dropout: TypeAlias = Callable[[Tensor], Tensor]
 """What happens to the values that each part of a layer adds."""
 

@@ -3,7 +3,7 @@
 import argparse
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar
@@ -11,34 +11,9 @@ from typing import Annotated, Any, NoReturn, TypeVar
 import tyro
 from pydantic import ValidationError
 
-from dmil_core.configs import (
-    DEFAULT_METHOD,
-    PRESETS,
-    SIZES,
-    EvaluationConfig,
-    ExperimentConfig,
-    SuiteConfig,
-    preset_of,
-)
-from dmil_core.errors import RunError, UserError, explain, shown
-from dmil_core.methods.registry import MethodError
+from dmil_core.errors import RunError, UserError, explain
 from services.cli.progress import console
-from services.cli.yaml_files import ConfigError, merged, read_yaml
-
-__all__ = [
-    "ConfigError",
-    "Quiet",
-    "checked",
-    "config_from",
-    "defaults_from",
-    "exit_code",
-    "main",
-    "method_named",
-    "parse",
-    "peek",
-    "suite_settings",
-    "with_evaluation",
-]
+from services.cli.yaml_files import ConfigError
 
 T = TypeVar("T")
 Quiet = Annotated[
@@ -49,7 +24,6 @@ Quiet = Annotated[
     ),
 ]
 """The flag ``--quiet`` of programs that take long; `parse` sees to it."""
-DEFAULT_SUITE, DEFAULT_PRESET = "ml10", "quick"
 PROGRAMS = {
     "meta-train": "collect demonstrations, meta-train, evaluate",
     "collect-demos": "let the scripted experts make demonstrations",
@@ -58,97 +32,6 @@ PROGRAMS = {
     "doctor": "check a machine or a cluster before a long run",
     "report": "draw what there is to look at, and lay tables out",
 }
-
-
-def defaults_from(arguments: Sequence[str]) -> ExperimentConfig:
-    """Return what ``--preset``, ``--suite``, ``--method``, ``--config`` and ``--demos`` say all other settings are.
-
-    Raises:
-        ConfigError: as `config_from`.
-    """
-    early = peek(arguments, preset=str, suite=str, method=str, config=Path, demos=str)
-    config = config_from(early.preset or DEFAULT_PRESET, early.config, early.suite, early.method)
-    if early.demos is None:
-        return config
-    demonstrations = config.demonstrations.model_copy(update={"source": early.demos})
-    return config.model_copy(update={"demonstrations": demonstrations})
-
-
-def config_from(
-    preset: str, file: Path | None, suite: str | None = None, method: str | None = None
-) -> ExperimentConfig:
-    """Return a preset's settings, with those that a YAML file gives in their place.
-
-    Args:
-        preset: a size, or a suite and a size as ml10-quick.
-        file: of settings.
-        suite: in place of the preset's.
-        method: in place of the file's, or of DMIL.
-
-    Raises:
-        ConfigError: names the key, what it got and what is allowed.
-    """
-    named, _, size = preset.rpartition("-")
-    if size not in SIZES or (named and preset not in PRESETS):
-        raise ConfigError(
-            f"--preset: got {preset!r}; wanted {', '.join(SIZES)}, with --suite, or one of {', '.join(PRESETS)}"
-        )
-    given = {} if file is None else read_yaml(file, "--config")
-    try:
-        settings = preset_of(suite or named or DEFAULT_SUITE, size, method or method_named(given)).model_dump()
-    except ValidationError as error:
-        raise _no_name(suite) from error
-    except MethodError as error:
-        raise ConfigError(str(error) if file is None or method is not None else f"{file}: {error}") from error
-    settings = merged(settings, given, str(file))
-    if method is not None:
-        settings["method"]["name"] = method
-    return checked(settings, "" if file is None else f"{file}: ")
-
-
-def method_named(given: Mapping[Any, Any]) -> Any:
-    """Return the method that some settings, by section, are of."""
-    section = given.get("method")
-    return section.get("name", DEFAULT_METHOD) if isinstance(section, Mapping) else DEFAULT_METHOD
-
-
-def suite_settings(suite: str, tasks: Sequence[str] | None = None) -> SuiteConfig:
-    """Return the settings of a suite, with `tasks` in place of those of both splits if they are given.
-
-    Raises:
-        ConfigError: for what cannot be the name of a suite, or no task at all.
-    """
-    if tasks is not None and not tasks:
-        raise ConfigError("--tasks: got none; wanted at least one; leave it out for all")
-    try:
-        return SuiteConfig.model_validate({"name": suite, "train_tasks": tasks, "test_tasks": tasks})
-    except ValidationError as error:
-        raise _no_name(suite) from error
-
-
-def _no_name(suite: str | None) -> ConfigError:
-    return ConfigError(f"--suite: got {shown(suite)}; wanted a name of letters, digits and hyphens, as ml10")
-
-
-def with_evaluation(config: ExperimentConfig, evaluation: EvaluationConfig) -> ExperimentConfig:
-    """Return `config` with another evaluation.
-
-    Raises:
-        ConfigError: if the two do not go together.
-    """
-    return checked({**config.model_dump(), "evaluation": evaluation.model_dump()})
-
-
-def checked(settings: dict[str, Any], origin: str = "") -> ExperimentConfig:
-    """Return the experiment of these settings.
-
-    Raises:
-        ConfigError: names the settings that are wrong, each behind `origin`.
-    """
-    try:
-        return ExperimentConfig.model_validate(settings)
-    except ValidationError as error:
-        raise ConfigError("\n".join(f"{origin}{line}" for line in explain(error).splitlines())) from error
 
 
 def peek(arguments: Sequence[str], **options: Any) -> argparse.Namespace:

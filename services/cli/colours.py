@@ -1,7 +1,5 @@
 """The colours of sub-skills: the same ones on the terminal, in plots and in videos."""
 
-__all__ = ["COLOURS", "colour_of"]
-
 COLOURS = (
     "#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#cc79a7", "#b8a900", "#882255", "#44aa99", "#999999",
 )  # fmt: skip

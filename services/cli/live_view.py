@@ -13,8 +13,6 @@ from rich.text import Text
 
 from services.cli.colours import colour_of
 
-__all__ = ["Figures", "Pace", "Screen", "Strip", "Tally", "Workers"]
-
 LABEL, WIDEST = 14, 80
 """Columns of the labels, and of the whole: a wider screen would leave parts behind when its terminal gets narrower."""
 NEAR = 0.01

@@ -11,8 +11,6 @@ from rich.live import Live
 
 from services.cli.live_view import Figures, Pace, Screen
 
-__all__ = ["Bar", "Clock", "Output", "console"]
-
 LINE_SECONDS = 5.0
 REFRESHES = 2
 """Of the screen in a second."""

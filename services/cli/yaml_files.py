@@ -9,8 +9,6 @@ import yaml
 from dmil_core.errors import UserError, shown
 from services.storage.files import read_file
 
-__all__ = ["ConfigError", "merged", "read_yaml"]
-
 MOST_BYTES = 2**16
 """In a file of settings; PyYAML may need a second for so many."""
 DEEPEST = 20

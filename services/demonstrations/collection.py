@@ -14,8 +14,6 @@ from services.distributed.failures import keeping_failures
 from services.distributed.runner import Runner
 from services.suites.base import Attempt, TaskSuite
 
-__all__ = ["DemonstrationCollection"]
-
 CHUNK = 10
 """Attempts of an expert in one call to a simulation worker."""
 PATIENCE = 10

@@ -18,8 +18,6 @@ from services.demonstrations.store import TaskDemonstrations, data_root
 from services.storage.files import inside
 from services.suites.base import TaskSuite
 
-__all__ = ["FORMS", "Recording", "check_dimensions", "demonstrations", "misfits", "places_of", "read_recordings"]
-
 FORMS = ("minari", "hdf5", "npz")
 """What data sets may be: an id of Minari's, a file as D4RL has them, a file of arrays."""
 MOST_BYTES = 2**32

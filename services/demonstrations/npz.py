@@ -18,8 +18,6 @@ from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.errors import shown
 from services.storage.files import read_file
 
-__all__ = ["read_npz"]
-
 FORMS = {"observations": ("f", 2), "actions": ("f", 2), "episode_lengths": ("iu", 1), "tasks": ("U", 1)}
 """Of each array, the kinds of numbers and the number of axes."""
 OPTIONAL = {"tasks"}

@@ -32,8 +32,6 @@ from services.storage.files import inside, read_file, room_for, sync
 from services.storage.remote import Storage, given_storage
 from services.suites.base import Attempt, TaskSuite
 
-__all__ = ["DemoStore", "TaskDemonstrations", "data_root", "open_store"]
-
 LIBRARIES = ("gymnasium", "gymnasium-robotics", "metaworld", "minari", "mujoco", "numpy")
 DIGESTS, ARRAYS, METADATA = "SHA256SUMS", "data/main_data.hdf5", "data/metadata.json"
 MOST_ARRAYS = 2**32

@@ -14,8 +14,6 @@ from services.distributed.errors import DeadlyCallError, LostError, NoRoomError
 from services.distributed.pool_events import Witness
 from services.distributed.stragglers import SLOWNESS, Patience
 
-__all__ = ["Pool"]
-
 PLACEMENT_SECONDS = 120
 DEATHS_ALLOWED = 3
 """A call in whose course so many actors ended is suspected to end them."""

@@ -15,8 +15,6 @@ from services.distributed.simulation_worker import SimulationWorker
 from services.distributed.timing import Span
 from services.suites.base import TaskSuite
 
-__all__ = ["AdaptationWorker", "BlockReport"]
-
 
 class BlockReport(NamedTuple):
     """What is told of a block beside its gradient."""

@@ -5,8 +5,6 @@ from typing import Any
 
 import ray
 
-__all__ = ["Call", "Worker", "now"]
-
 
 class Call:
     """One call of an actor's method: where it runs, and what came of it.

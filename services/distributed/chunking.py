@@ -6,8 +6,6 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float32
 
-__all__ = ["Freight", "pack", "unpack"]
-
 Freight: TypeAlias = Sequence[Float32[np.ndarray, " _"]]
 """A flat vector in consecutive pieces."""
 

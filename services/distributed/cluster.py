@@ -8,8 +8,6 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["cpus", "joined"]
-
 OBJECT_STORE_BYTES = 500_000_000
 
 

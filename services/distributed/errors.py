@@ -7,8 +7,6 @@ from dmil_core.errors import RunError, UserError
 if TYPE_CHECKING:
     from services.distributed.calls import Call
 
-__all__ = ["DeadlyCallError", "LostError", "NoRoomError"]
-
 
 class NoRoomError(UserError):
     """More actors were asked for than the cluster has room for."""

@@ -11,8 +11,6 @@ from dmil_core.errors import RunError, UserError, WorkError
 from services.storage.files import read_file, write_file
 from services.storage.provenance import library_versions
 
-__all__ = ["Failure", "FailureError", "keeping_failures", "read_failure"]
-
 MOST_BYTES = 10_000_000
 
 

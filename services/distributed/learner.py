@@ -11,8 +11,6 @@ from dmil_core.outer_loop import OuterState, OuterStep
 from services.distributed.chunking import Freight, pack, unpack
 from services.distributed.timing import Span
 
-__all__ = ["Learner", "StepReport"]
-
 
 class StepReport(NamedTuple):
     """What is told of an outer step beside the new parameters."""

@@ -12,8 +12,6 @@ from services.distributed.timing import Timing
 if TYPE_CHECKING:
     from services.distributed.calls import Call
 
-__all__ = ["MEASURES", "Crew", "Measure", "Meter", "RayMeter"]
-
 
 class Measure(NamedTuple):
     """Something that is counted or measured."""

@@ -16,8 +16,6 @@ import psutil
 
 from services.storage.provenance import library_versions
 
-__all__ = ["NodeFacts", "cluster_facts", "facts"]
-
 SECONDS_TO_ANSWER = 60.0
 
 

@@ -5,8 +5,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from services.distributed.calls import Call
 
-__all__ = ["Witness"]
-
 
 class Witness:
     """Keeps nothing of what it is told."""

@@ -17,8 +17,6 @@ from services.distributed.timing import Span, Timing
 if TYPE_CHECKING:
     from services.distributed.calls import Call
 
-__all__ = ["FAN_IN", "RayMetaTraining"]
-
 FAN_IN = 8
 """Gradients that one worker adds at a time, a power of two; it does not change the result."""
 LOSSES_ALLOWED = 10

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from services.distributed.actor_pool import Pool
     from services.distributed.calls import Call
 
-__all__ = ["RayRunner"]
-
 POLITENESS = 10
 """How far a simulation beside meta-training stands back, see `os.nice`."""
 

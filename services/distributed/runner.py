@@ -21,8 +21,6 @@ from services.distributed.simulation_worker import SimulationWorker
 from services.distributed.timing import Timing
 from services.suites.base import TaskSuite
 
-__all__ = ["Iteration", "LocalRunner", "MetaTraining", "Plan", "Runner", "Simulation"]
-
 
 class Plan(NamedTuple):
     """What meta-training starts from; only the state changes on the way."""

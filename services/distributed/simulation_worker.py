@@ -13,21 +13,10 @@ from dmil_core.errors import piece_of_work
 from dmil_core.methods.base import Method, Policy, Rollout
 from dmil_core.networks import unflatten
 from dmil_core.seeding import stream_seed
-from services.rollouts.trials import (
-    Imitation,
-    Trial,
-    TrialOutcome,
-    demonstrate,
-    episodes_beside,
-    imitate,
-    practise,
-    try_out,
-)
+from services.rollouts.episodes import demonstrate, episodes_beside, practise
+from services.rollouts.trials import Imitation, Trial, TrialOutcome, imitate, try_out
 from services.rollouts.verification import VerificationRow, verify
 from services.suites.base import Attempt, Environment, TaskSuite, build_env
-
-__all__ = ["SimulationWorker", "piece_of_call"]
-
 
 ENVIRONMENTS_KEPT = 40
 """At most so many environments stay built in a worker, 24 MB each in Meta-World."""
@@ -77,7 +66,7 @@ class SimulationWorker:
             return verify(self._suite, task, seeds, noise)
 
     def practise(self, policy: Policy, task: str, seed: int, steps: int) -> list[Rollout]:
-        """Let a policy act in a task for so many steps, see `services.rollouts.trials.practise`."""
+        """Let a policy act in a task for so many steps, see `services.rollouts.episodes.practise`."""
         envs = self._environments(task, episodes_beside(steps, self._suite.horizon))
         return practise(policy, envs, seed, steps, self._suite.horizon)
 

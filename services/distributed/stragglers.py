@@ -5,8 +5,6 @@ from statistics import median
 
 from services.distributed.calls import Call
 
-__all__ = ["SLOWNESS", "Patience"]
-
 SLOWNESS = 10
 """A call that takes so many times what its like take is slow."""
 LEAST_SECONDS = 2.0

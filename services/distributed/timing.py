@@ -3,8 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-__all__ = ["Span", "Timing"]
-
 
 class Span(NamedTuple):
     """When some work began and ended, in seconds of `time.perf_counter`: one clock for all processes of a machine."""

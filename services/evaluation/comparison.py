@@ -23,12 +23,10 @@ from dmil_core.errors import UserError
 from dmil_core.seeding import stream
 from dmil_core.statistics import Interval, interquartile_mean, mean_score, stratified_bootstrap, success_rate
 from services.evaluation.paper_results import Published
-from services.evaluation.results import EpisodeResult, EvaluationFolder, Split
+from services.evaluation.results import EpisodeResult, EvaluationFolder, Metric
 from services.evaluation.summary import sub_skill_use
-from services.sweeps.settings import Metric
+from services.suites.base import Split
 from services.tracking.history import read_metrics
-
-__all__ = ["DIGITS", "Cell", "Comparison", "ComparisonError", "Contender", "Difference", "Place", "Tried", "Unpaired"]
 
 Answer = Literal["yes, higher", "yes, lower", "not decided"]
 DIGITS: Mapping[Metric, int] = {"success_rate": 3, "score": 2}

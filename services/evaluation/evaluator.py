@@ -19,15 +19,13 @@ from services.demonstrations.store import TaskDemonstrations
 from services.distributed.failures import keeping_failures
 from services.distributed.metrics import EPISODES, SUCCESS_RATE, SUCCESSES, Meter
 from services.distributed.runner import Runner, Simulation
-from services.evaluation.results import AdaptationResult, EpisodeResult, ImitationResult, Split, write_rows
+from services.evaluation.results import AdaptationResult, EpisodeResult, ImitationResult, write_rows
 from services.evaluation.summary import Evaluation, cells, rates, sub_skill_use
 from services.rollouts.trials import Imitation, Trial, TrialOutcome, trials
 from services.storage.checkpoints import Checkpoint, Checkpoints
 from services.storage.provenance import library_versions
-from services.suites.base import TaskSuite
+from services.suites.base import Split, TaskSuite
 from services.tracking import Tracker
-
-__all__ = ["Evaluations", "Evaluator", "Tallies", "write_evaluation"]
 
 
 class Tallies:

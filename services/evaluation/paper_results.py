@@ -9,9 +9,7 @@ from pydantic import BaseModel
 
 from dmil_core.dmil_config import DmilConfig
 from dmil_core.settings import MethodConfig
-from services.evaluation.results import Split
-
-__all__ = ["Published", "figure", "figure_of"]
+from services.suites.base import Split
 
 BENCHMARKS = {"ml10": "ML10", "ml45": "ML45"}
 KITCHENS = ("kitchen-topburner", "kitchen-microwave", "kitchen-kettle", "kitchen-slide")

@@ -10,20 +10,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dmil_core.errors import UserError, explain
 from services.storage.files import read_file, write_file
+from services.suites.base import Split
 
-__all__ = [
-    "AdaptationResult",
-    "EpisodeResult",
-    "EvaluationFolder",
-    "ImitationResult",
-    "RowError",
-    "Split",
-    "read_lines",
-    "read_rows",
-    "write_rows",
-]
-
-Split = Literal["meta-training", "meta-testing"]
 Row = TypeVar("Row", bound=BaseModel)
 MOST_BYTES = 2**30
 """In a file of rows."""
@@ -155,3 +143,6 @@ class EvaluationFolder:
     def adaptations(self) -> list[AdaptationResult]:
         """A row an adaptation."""
         return read_rows(self.folder / "adaptations.jsonl", AdaptationResult)
+
+
+Metric = Literal["success_rate", "score"]

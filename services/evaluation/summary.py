@@ -13,27 +13,9 @@ from rich.table import Table
 from dmil_core.settings import MethodConfig
 from dmil_core.statistics import Rate, mean_score, share_entropy, success_rate
 from services.evaluation.paper_results import Published, figure_of
-from services.evaluation.results import AdaptationResult, EpisodeResult, Split
+from services.evaluation.results import AdaptationResult, EpisodeResult
 from services.storage.checkpoints import Checkpoint
-
-__all__ = [
-    "AGAINST_COLLAPSE",
-    "COLLAPSED",
-    "Cell",
-    "Evaluation",
-    "Score",
-    "SubSkillUse",
-    "Summary",
-    "cells",
-    "described",
-    "headline",
-    "rates",
-    "sub_skill_use",
-    "summarise",
-    "table",
-    "table_markdown",
-    "write_summary",
-]
+from services.suites.base import Split
 
 BEST = 5
 """So many of a task's episodes count in the authors' own figure for the kitchen."""

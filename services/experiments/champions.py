@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from mlflow.entities import LoggedModel
     from mlflow.entities.model_registry import ModelVersion
 
-__all__ = ["ALIAS", "Contest", "PromotionError", "RegistryError", "is_better", "open_contest"]
-
 ALIAS = "champion"
 
 

@@ -27,25 +27,14 @@ from services.distributed.metrics import CHECKPOINT_TIME, SPOOL_RECORDS
 from services.distributed.ray_runner import RayRunner
 from services.distributed.runner import LocalRunner, Plan, Runner
 from services.evaluation.evaluator import Evaluations, Evaluator, Tallies, write_evaluation
-from services.evaluation.results import Split
 from services.evaluation.summary import AGAINST_COLLAPSE, COLLAPSED, Evaluation
 from services.experiments.iteration_metrics import figures_of, iteration_metrics, nonfinite_in_words, shares_of
 from services.rollouts.trials import TrialOutcome
 from services.storage.checkpoints import Checkpoint, CheckpointError, Checkpoints, Manifest
 from services.storage.provenance import library_versions
-from services.suites.base import TaskSuite
+from services.suites.base import Split, TaskSuite
 from services.suites.registry import open_suite
 from services.tracking import Tracker
-
-__all__ = [
-    "CollapseWatch",
-    "Experiment",
-    "NoWorkersError",
-    "NonFiniteError",
-    "OnNonfinite",
-    "RunnerKind",
-    "open_runner",
-]
 
 RunnerKind = Literal["ray", "local"]
 OnNonfinite = Literal["stop", "skip"]

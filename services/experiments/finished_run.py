@@ -18,8 +18,6 @@ from services.storage.files import read_file
 from services.storage.run_folders import FolderError, find_folder
 from services.tracking.history import Origin, read_metrics, read_origin
 
-__all__ = ["FinishedRun", "UnfinishedError"]
-
 MARK, BEGUN, CHECKPOINTS = "summary.json", "config.json", "checkpoints"
 """What the folder of a finished run is known by, what that of any run, and what no evaluation's has."""
 MOST_BYTES = 2**24

@@ -8,8 +8,6 @@ from dmil_core.statistics import share_entropy
 from services.cli.live_view import Figures
 from services.distributed.runner import Iteration
 
-__all__ = ["figures_of", "iteration_metrics", "nonfinite_in_words", "shares_of"]
-
 
 def iteration_metrics(iteration: Iteration) -> dict[str, float]:
     """Return an iteration's metrics: the means over its slots, what they say together, and how fast it went."""

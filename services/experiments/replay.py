@@ -18,8 +18,6 @@ from services.experiments.finished_run import FinishedRun
 from services.rollouts.recording import Film, Footage, Watched, watch, watch_expert
 from services.suites.base import Environment, build_env
 
-__all__ = ["Replay", "ReplayError", "Seen", "replaying"]
-
 
 class ReplayError(UserError):
     """An episode or a demonstration that cannot be run again."""

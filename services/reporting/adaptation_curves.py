@@ -13,7 +13,7 @@ from dmil_core.configs import EvaluationConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.errors import explain
 from dmil_core.statistics import Rate, success_rate
-from services.cli.arguments import with_evaluation
+from services.cli.composition import with_evaluation
 from services.cli.progress import Bar, console
 from services.distributed.runner import Runner
 from services.evaluation.evaluator import Evaluator
@@ -25,8 +25,6 @@ from services.reporting.lineup import MOST_TASKS, MismatchError, policy_after
 from services.reporting.page import DataTable, Part, Prose, Section
 from services.reporting.sub_skill_pictures import marker_of
 from services.storage.files import read_file, write_file
-
-__all__ = ["SHOTS", "CurvePlan", "Point", "adaptation_section", "measure", "points"]
 
 FOLDER, PLAN, IMITATION = "adaptation", "plan.json", "imitation.jsonl"
 SHOTS = (1, 3, 5, 10)

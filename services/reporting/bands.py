@@ -11,8 +11,6 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from services.reporting.drawing import DASHES, Picture, colour_of, drawn, panels
 
-__all__ = ["Curve", "Metrics", "curve_of", "curves"]
-
 Metrics = Sequence[Sequence[Mapping[str, float]]]
 """Of each seed: the metrics of each iteration, under ``iteration`` its number."""
 COLUMNS = 3

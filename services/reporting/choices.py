@@ -13,10 +13,8 @@ from dmil_core.settings import sub_skills_of
 from services.experiments.finished_run import FinishedRun
 from services.reporting.lineup import Lineup, has_sub_skills, policies
 from services.reporting.usage import Usage, usage
-from services.rollouts.trials import record
+from services.rollouts.episodes import record
 from services.suites.base import Environment, build_env
-
-__all__ = ["DEMONSTRATIONS", "ROLLOUTS", "Choices", "Timeline", "choices_on"]
 
 DEMONSTRATIONS, ROLLOUTS = "held-out demonstrations", "rollouts"
 

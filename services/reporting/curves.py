@@ -8,13 +8,12 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from dmil_core.settings import MethodConfig
-from services.evaluation.results import EpisodeResult, Split
+from services.evaluation.results import EpisodeResult
 from services.evaluation.summary import cells
 from services.experiments.finished_run import FinishedRun
 from services.reporting.drawing import DASHES, Picture, colour_of, drawn, panels, style_of
 from services.reporting.page import Part, Prose, Section
-
-__all__ = ["Panel", "draw_metrics", "draw_success", "training_curves"]
+from services.suites.base import Split
 
 Metrics = Sequence[Mapping[str, float]]
 Lines = dict[tuple[Split, int], list[tuple[int, float, float, float]]]

@@ -17,8 +17,6 @@ from matplotlib.figure import Figure
 
 from services.cli.colours import COLOURS, colour_of
 
-__all__ = ["DASHES", "INK", "Picture", "colour_of", "drawn", "panels", "style_of"]
-
 DASHES = ("solid", "dashed", "dotted", "dashdot")
 INK = "#010203"
 """Stands for the page's own colour of text until the SVG is on the page."""

@@ -15,8 +15,6 @@ from services.reporting.lineup import Lineup, has_sub_skills, policies
 from services.reporting.page import Part, Prose, Section
 from services.reporting.sub_skill_pictures import marker_of
 
-__all__ = ["Thinned", "embed", "embedding_section", "thin_out"]
-
 SHOTS, OTHERS = 3, 16
 """Demonstrations that the paper adapts to, and those whose states it draws."""
 PERPLEXITY, SEED = 30.0, 0

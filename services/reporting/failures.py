@@ -17,8 +17,6 @@ from services.reporting.page import Clip, Commands, DataTable, Part, Prose, Sect
 from services.reporting.video import camera_of, command, name_of, side_of
 from services.suites.base import Measure, measure_of
 
-__all__ = ["draw_episodes", "failures_of_run", "worst_tasks"]
-
 MOST_TASKS = 3
 MOST_EPISODES = 20
 """Of a task; whole trials are run, until there are so many."""

@@ -17,8 +17,6 @@ from services.rollouts.recording import Film, Frame
 from services.storage.files import write_file
 from services.suites.rendering import View
 
-__all__ = ["FORMS", "Form", "FormName", "Side", "compose", "film_of", "write_film"]
-
 FormName = Literal["mp4", "gif"]
 FONTS = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
 PAPER, INK, FAINT, NO_SUB_SKILL = "#16181c", "#ffffff", "#b0b0b0", "#4a4d55"

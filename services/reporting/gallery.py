@@ -15,13 +15,11 @@ from matplotlib import pyplot
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
 from services.cli.arguments import ConfigError, exit_code, parse
 from services.cli.progress import Bar, console
-from services.rollouts.trials import demonstrate
+from services.rollouts.episodes import demonstrate
 from services.storage.files import room_for
 from services.suites.base import TaskSuite
 from services.suites.registry import open_suite
 from services.suites.rendering import View, picture
-
-__all__ = ["SUITES", "Arguments", "draw_gallery", "run"]
 
 SUITES = (
     "ml45", "ml10", "push-around-wall", "kitchen-topburner", "kitchen-microwave", "kitchen-kettle", "kitchen-slide",

@@ -8,8 +8,6 @@ from matplotlib import colormaps
 
 from services.reporting.drawing import Picture, drawn, panels
 
-__all__ = ["heat_map", "ink_on"]
-
 COLOURS = colormaps["cividis"].resampled(21)
 """Even to colour-blind eyes, and in grey (Nuñez et al. 2018)."""
 INKS = {"#000000": 0.0, "#ffffff": 1.0}

@@ -15,18 +15,6 @@ from services.distributed.runner import LocalRunner
 from services.experiments.experiment import Experiment
 from services.experiments.finished_run import FinishedRun
 
-__all__ = [
-    "ADAPTATIONS",
-    "MOST_TASKS",
-    "Lineup",
-    "MismatchError",
-    "Shots",
-    "has_sub_skills",
-    "line_up",
-    "policies",
-    "policy_after",
-]
-
 MOST_TASKS = 4
 """So many of a run's meta-testing tasks are shown, unless tasks are named."""
 ADAPTATIONS = ("before", "after")

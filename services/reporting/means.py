@@ -11,8 +11,6 @@ from matplotlib.figure import Figure
 from services.evaluation.comparison import DIGITS, Cell, Comparison
 from services.reporting.drawing import Picture, colour_of, drawn, panels
 
-__all__ = ["draw_means", "means"]
-
 MARKERS = "os^Dv"
 """Of the numbers of shots."""
 APART = 0.17

@@ -10,8 +10,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from services.reporting.drawing import Picture
 from services.storage.files import write_file
 
-__all__ = ["Clip", "Commands", "DataTable", "Part", "Prose", "Section", "write_page"]
-
 TYPES = {".mp4": "video/mp4", ".gif": "image/gif"}
 
 

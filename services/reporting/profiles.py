@@ -10,8 +10,6 @@ from dmil_core.seeding import stream
 from dmil_core.statistics import interquartile_mean, performance_profile, profile_band
 from services.reporting.drawing import DASHES, Picture, colour_of, drawn, panels
 
-__all__ = ["Runs", "profiles"]
-
 Runs = Mapping[str, Float[np.ndarray, "seeds tasks"]]
 """By row: the success rate, or mean score, of each seed on each task."""
 

@@ -7,8 +7,6 @@ from services.experiments.finished_run import FinishedRun
 from services.reporting.page import Commands, DataTable, Part, Prose, Section
 from services.reporting.settings import flags, nearest_preset
 
-__all__ = ["episodes_of_run", "origin_of_run"]
-
 DIGITS = 16
 """Of a data set's digest."""
 MOST_ROWS = 6000

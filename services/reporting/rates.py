@@ -5,13 +5,12 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from dmil_core.statistics import mean_score, success_rate
-from services.evaluation.results import EpisodeResult, Split
+from services.evaluation.results import EpisodeResult
 from services.evaluation.summary import AGAINST_COLLAPSE, described, headline
 from services.experiments.finished_run import FinishedRun
 from services.reporting.drawing import INK, Picture, colour_of, drawn, panels
 from services.reporting.page import DataTable, Part, Prose, Section
-
-__all__ = ["Estimate", "estimates", "rates_of_tasks", "table_of_all"]
+from services.suites.base import Split
 
 ABREAST = 4
 """Panels side by side at most."""

@@ -13,10 +13,10 @@ from services.cli.arguments import ConfigError, parse
 from services.cli.progress import Bar, console
 from services.experiments.experiment import RunnerKind, open_runner
 from services.experiments.finished_run import FinishedRun
-from services.report import PAGE
 from services.reporting.adaptation_curves import adaptation_section, measure
 from services.reporting.curves import training_curves
 from services.reporting.embedding import embedding_section
+from services.reporting.end_of_run import PAGE
 from services.reporting.failures import failures_of_run
 from services.reporting.lineup import has_sub_skills, line_up
 from services.reporting.page import Section, write_page
@@ -24,8 +24,6 @@ from services.reporting.provenance import episodes_of_run, origin_of_run
 from services.reporting.rates import rates_of_tasks, table_of_all
 from services.reporting.settings import settings_of_run
 from services.reporting.sub_skills import sub_skill_sections
-
-__all__ = ["Arguments", "run", "write_run_page"]
 
 Writing = Callable[[FinishedRun], Sequence[Section]]
 

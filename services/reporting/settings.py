@@ -10,8 +10,6 @@ from dmil_core.configs import SIZES, ExperimentConfig, preset_of
 from services.experiments.finished_run import FinishedRun
 from services.reporting.page import DataTable, Part, Prose, Section
 
-__all__ = ["Nearest", "flags", "nearest_preset", "settings_of_run"]
-
 
 class Nearest(NamedTuple):
     """The preset that the fewest settings differ from."""

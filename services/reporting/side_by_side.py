@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from services.evaluation.comparison import DIGITS, Cell, Comparison, Contender, Difference, Place, Unpaired
-from services.evaluation.results import Split
 from services.reporting.bands import curves
 from services.reporting.drawing import Picture
 from services.reporting.heat_map import heat_map
@@ -16,8 +15,7 @@ from services.reporting.means import means
 from services.reporting.page import Commands, DataTable, Part, Prose, Section, write_page
 from services.reporting.profiles import Runs, profiles
 from services.storage.checksums import sha256
-
-__all__ = ["write_comparison"]
+from services.suites.base import Split
 
 
 def write_comparison(

@@ -14,8 +14,6 @@ from services.reporting.choices import Choices, Timeline
 from services.reporting.drawing import INK, Picture, colour_of, drawn, panels
 from services.reporting.usage import Usage, segments
 
-__all__ = ["draw_timelines", "draw_transitions", "draw_usage", "marker_of", "on_colour"]
-
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
 """By these sub-skills are told apart where there is no room for a number."""
 LEGIBLE = 0.05

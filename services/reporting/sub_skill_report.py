@@ -23,8 +23,6 @@ from services.reporting.page import DataTable, Prose, write_page
 from services.reporting.sub_skills import sub_skill_sections
 from services.storage.run_folders import find_folder
 
-__all__ = ["Arguments", "run"]
-
 MARK = "config.json"
 """What the folder of a run, or of a configuration that a sweep has trained, is known by."""
 

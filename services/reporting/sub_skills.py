@@ -9,8 +9,6 @@ from services.reporting.lineup import Lineup, has_sub_skills
 from services.reporting.page import DataTable, Part, Prose, Section
 from services.reporting.sub_skill_pictures import draw_timelines, draw_transitions, draw_usage
 
-__all__ = ["sub_skill_sections"]
-
 DRAWN = 3
 """So many demonstrations are drawn; the statistics are of all."""
 

@@ -6,8 +6,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-__all__ = ["Segment", "Usage", "segments", "usage"]
-
 
 class Segment(NamedTuple):
     """Steps one after the other for which a sub-skill is kept."""

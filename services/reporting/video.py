@@ -21,8 +21,6 @@ from services.experiments.replay import Replay, Seen, replaying
 from services.reporting.film import FORMS, Form, FormName, Side, film_of, write_film
 from services.suites.rendering import View
 
-__all__ = ["Arguments", "CameraError", "camera_of", "command", "name_of", "run", "side_of"]
-
 
 @dataclass(frozen=True)
 class Arguments:

@@ -9,11 +9,9 @@ from jaxtyping import Float32, Float64, UInt8
 
 from dmil_core.configs import DemonstrationConfig
 from dmil_core.methods.base import Policy
-from services.rollouts.trials import Episode, demonstrate, rollout
+from services.rollouts.episodes import Episode, demonstrate, rollout
 from services.suites.base import Attempt, Environment, Expert
 from services.suites.rendering import Camera, View
-
-__all__ = ["Film", "Footage", "Frame", "Watched", "watch", "watch_expert"]
 
 
 class Film(NamedTuple):
@@ -53,7 +51,7 @@ class Watched(NamedTuple):
     footage: Footage
 
 
-class Observer(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
+class _Observer(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
     """Keeps what happens in an environment from its reset on, and changes nothing in it."""
 
     def __init__(self, env: Environment, film: Film | None) -> None:
@@ -121,7 +119,7 @@ def watch(
     Raises:
         RenderingError: if there is nothing here to draw with.
     """
-    observers = [Observer(env, films.get(place)) for place, env in enumerate(envs)]
+    observers = [_Observer(env, films.get(place)) for place, env in enumerate(envs)]
     try:
         episodes = rollout(policy, observers, seeds, horizon)
         return [Watched(episode, observer.footage()) for episode, observer in zip(episodes, observers, strict=True)]
@@ -138,7 +136,7 @@ def watch_expert(
     Raises:
         RenderingError: if there is nothing here to draw with.
     """
-    observer = Observer(env, film)
+    observer = _Observer(env, film)
     try:
         return demonstrate(expert, observer, seed, horizon, config), observer.footage()
     finally:

@@ -7,10 +7,8 @@ import gymnasium
 import numpy as np
 
 from dmil_core.configs import DemonstrationConfig
-from services.rollouts.trials import demonstrate
+from services.rollouts.episodes import demonstrate
 from services.suites.base import Attempt, Environment, SuiteError, TaskSuite, build_env
-
-__all__ = ["VerificationRow", "verify"]
 
 
 class VerificationRow(NamedTuple):

@@ -22,8 +22,6 @@ from services.cli.progress import console
 from services.storage.checksums import checked_file, listing, sha256
 from services.storage.files import inside, read_file, room_for, sync
 
-__all__ = ["FILES", "SEAL", "Checkpoint", "CheckpointError", "Checkpoints", "Manifest"]
-
 MANIFEST, SEAL = "manifest.json", "manifest.sha256"
 PARAMETERS, OPTIMISER, CONSTANTS = "parameters.safetensors", "optimiser.safetensors", "constants.safetensors"
 MOST_MANIFEST = 2**22

@@ -9,8 +9,6 @@ from pathlib import Path
 
 from services.storage.files import inside, read_file, write_file
 
-__all__ = ["check_listing", "checked_file", "listing", "sha256", "write_listing"]
-
 MOST_LISTED = 2**16
 """Bytes of a listing."""
 

@@ -10,8 +10,6 @@ from pathlib import Path
 
 from dmil_core.errors import RunError
 
-__all__ = ["DiskFullError", "inside", "read_file", "room_for", "sync", "write_file"]
-
 FULL = {errno.ENOSPC, errno.EDQUOT}
 FULL_IN_WORDS = ("No space left on device", "Disk quota exceeded", "os error 28", "errno = 28")
 """How libraries that write by themselves say it."""

@@ -5,8 +5,6 @@ from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
-__all__ = ["git_commit", "library_versions"]
-
 LIBRARIES = ("dmil", "torch", "numpy", "mujoco", "metaworld", "gymnasium", "ray", "mlflow")
 
 

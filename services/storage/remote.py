@@ -14,8 +14,6 @@ import fsspec
 
 from dmil_core.errors import RunError, UserError
 
-__all__ = ["STORAGE", "Storage", "StorageError", "TroubleError", "given_storage"]
-
 STORAGE = "DMIL_STORAGE"
 PACKAGES = {"s3": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs"}
 KINDS = "file:///folder, s3://bucket/folder, gs://bucket/folder"

@@ -9,8 +9,6 @@ from pathlib import Path
 from services.storage.checkpoints import FILES, SEAL
 from services.storage.remote import Storage, given_storage
 
-__all__ = ["Replica", "replicated", "restored"]
-
 NAMED = r"iteration-\d{7,}"
 IDENTITY = "mlflow_run.json"
 RECORDS = (

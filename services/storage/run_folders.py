@@ -5,8 +5,6 @@ from pathlib import Path
 from dmil_core.errors import UserError, shown
 from services.storage.files import inside
 
-__all__ = ["FolderError", "find_folder", "new_folder"]
-
 
 class FolderError(UserError):
     """A name that no folder can have or has."""

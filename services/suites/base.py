@@ -1,6 +1,6 @@
 """A suite of tasks behind one small protocol."""
 
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
@@ -8,8 +8,6 @@ from gymnasium.spaces import Box
 from jaxtyping import Float32, Float64
 
 from dmil_core.errors import UserError
-
-__all__ = ["Attempt", "Environment", "Expert", "Measure", "SuiteError", "TaskSuite", "build_env", "measure_of"]
 
 Environment = gymnasium.Env[np.ndarray, np.ndarray]
 """A task's environment, with a flat observation and actions in a `Box`. ``reset(seed=n)`` twice gives the same episode
@@ -123,3 +121,6 @@ def build_env(suite: TaskSuite, task: str, *, measured: bool = False) -> Environ
                 f"{'obs_dim' if field == 'observation_space' else 'action_dim'} says; mend either"
             )
     return env
+
+
+Split = Literal["meta-training", "meta-testing"]

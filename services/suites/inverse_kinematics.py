@@ -6,8 +6,6 @@ import mujoco as compiled_mujoco
 import numpy as np
 from jaxtyping import Float64
 
-__all__ = ["Arm", "Pose", "bounded_least_squares", "pose_error"]
-
 mujoco: Any = compiled_mujoco  # compiled, so a type checker sees nothing of it
 
 

@@ -24,8 +24,6 @@ with contextlib.redirect_stderr(io.StringIO()):  # it prints a notice about envi
 
 mujoco: Any = compiled_mujoco  # compiled, so a type checker sees nothing of it
 
-__all__ = ["NAMES", "SPLITS", "KitchenSuite", "KitchenTask", "UnknownKitchenTaskError", "chains", "replay"]
-
 NAMES = {
     "microwave": "microwave",
     "kettle": "kettle",

@@ -19,8 +19,6 @@ from jaxtyping import Float32, Float64
 
 from services.suites.inverse_kinematics import Arm, Pose, bounded_least_squares, pose_error
 
-__all__ = ["SUB_TASKS", "KitchenExpert", "SubTask", "kitchen_model"]
-
 mujoco: Any = compiled_mujoco  # compiled, so a type checker sees nothing of it
 
 STEP = 0.08

@@ -16,8 +16,6 @@ from services.suites.metaworld_speed import fast_environment
 from services.suites.push_around_wall import PushAroundWallEnv, PushAroundWallExpert
 from services.suites.rendering import View
 
-__all__ = ["SPLITS", "TASKS", "MetaWorldSuite", "UnknownSuiteError", "UnknownTaskError"]
-
 HORIZONS = {"paper": 300, "benchmark": 500}
 """Steps in an episode, by protocol."""
 GOAL_DIM = 3

@@ -26,8 +26,6 @@ from metaworld.sawyer_xyz_env import SawyerXYZEnv
 from metaworld.utils import reward_utils
 from scipy.spatial.transform import Rotation
 
-__all__ = ["fast_environment", "quaternion"]
-
 mujoco: Any = compiled_mujoco  # compiled, so a type checker sees nothing of it
 
 FRAME = 18

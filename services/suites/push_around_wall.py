@@ -17,8 +17,6 @@ from metaworld.policies.policy import move
 from metaworld.sawyer_xyz_env import SawyerXYZEnv
 from metaworld.utils import reward_utils
 
-__all__ = ["CubePath", "PushAroundWallEnv", "PushAroundWallExpert"]
-
 mujoco: Any = compiled_mujoco  # compiled, so a type checker sees nothing of it
 
 ENDS = (-0.02, 0.22)

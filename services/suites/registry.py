@@ -11,8 +11,6 @@ from dmil_core.configs import SuiteConfig
 from dmil_core.errors import UserError
 from services.suites.base import SuiteError, TaskSuite
 
-__all__ = ["ENTRY_POINTS", "SuiteError", "open_suite"]
-
 ENTRY_POINTS = "dmil.suites"
 """The group of entry points in which a package registers what makes a suite from a `SuiteConfig`."""
 OURS = {"kitchen": "services.suites.kitchen:KitchenSuite", "": "services.suites.metaworld:MetaWorldSuite"}

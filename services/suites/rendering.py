@@ -12,8 +12,6 @@ from jaxtyping import UInt8
 
 from dmil_core.errors import UserError
 
-__all__ = ["Camera", "RenderingError", "View", "picture", "working_backend"]
-
 mujoco: Any = compiled_mujoco  # compiled, so a type checker sees nothing of it
 
 BACKENDS = {"egl": "libegl1 libgl1", "osmesa": "libosmesa6"}

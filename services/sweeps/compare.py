@@ -21,8 +21,6 @@ from services.storage.run_folders import find_folder
 from services.sweeps.folders import MARK, SweepFolder
 from services.sweeps.tables import Tables, comparison_of, tables_of
 
-__all__ = ["Arguments", "run", "runs_compared", "write_sweep_page"]
-
 
 @dataclass(frozen=True)
 class Arguments:

@@ -22,8 +22,6 @@ from services.storage.checksums import sha256
 from services.storage.files import inside, read_file, write_file
 from services.sweeps.settings import PlannedTrial, Size, Sweep, planned
 
-__all__ = ["MARK", "TRAINED", "SweepError", "SweepFolder", "SweepRecord", "TrialResult", "evaluated", "trained"]
-
 Record = TypeVar("Record", bound=BaseModel)
 MOST_BYTES = 2**22
 MARK = "sweep.json"

@@ -12,17 +12,16 @@ from pydantic import Field, model_validator
 from dmil_core.configs import EvaluationConfig, ExperimentConfig, SuiteConfig, SuiteName, preset_of
 from dmil_core.seeding import stream
 from dmil_core.settings import Count, NotNegative, Seed, Settings
-from services.cli.arguments import ConfigError, checked, method_named
+from services.cli.arguments import ConfigError
+from services.cli.composition import checked, method_named
 from services.cli.yaml_files import merged
-from services.evaluation.results import Split
+from services.evaluation.results import Metric
+from services.suites.base import Split
 from services.suites.registry import open_suite
-
-__all__ = ["Metric", "PlannedTrial", "Resources", "Scale", "Search", "Size", "Sweep", "planned", "row_name"]
 
 Name = Annotated[str, Field(min_length=1, max_length=60)]
 Overrides = dict[str, Any]
 """Settings of an experiment by section, as in a file of ``--config``."""
-Metric = Literal["success_rate", "score"]
 Size = Literal["smoke", "quick", "paper"]
 
 

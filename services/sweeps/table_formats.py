@@ -21,8 +21,6 @@ from services.sweeps.folders import MARK, SweepFolder
 from services.sweeps.tables import Sample, Tables, column_of, comparison_of, tables_of
 from services.tracking import Tracker
 
-__all__ = ["publish", "run", "show", "write_tables"]
-
 
 def _grid(tables: Tables) -> dict[str, dict[str, Cell]]:
     grid: dict[str, dict[str, Cell]] = {row: {} for row in tables.rows}

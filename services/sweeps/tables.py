@@ -6,13 +6,11 @@ from typing import Literal
 
 from pydantic import BaseModel
 
-from services.cli.arguments import with_evaluation
+from services.cli.composition import with_evaluation
 from services.evaluation.comparison import Cell, Comparison, Contender, Difference, Place, Unpaired
 from services.evaluation.paper_results import figure
+from services.evaluation.results import Metric
 from services.sweeps.folders import SweepFolder
-from services.sweeps.settings import Metric
-
-__all__ = ["Sample", "Tables", "column_of", "comparison_of", "tables_of"]
 
 
 class Sample(BaseModel):

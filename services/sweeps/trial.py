@@ -13,7 +13,7 @@ from filelock import FileLock
 from pydantic import TypeAdapter
 
 from dmil_core.errors import RunError, UserError
-from services.cli.arguments import with_evaluation
+from services.cli.composition import with_evaluation
 from services.cli.progress import Clock, console
 from services.demonstrations.store import DemoStore
 from services.distributed.ray_runner import RayRunner
@@ -28,8 +28,6 @@ from services.sweeps.folders import TRAINED, SweepFolder, TrialResult, evaluated
 from services.sweeps.settings import PlannedTrial
 from services.tracking import Tracker, introduce
 from services.tracking.history import read_metrics
-
-__all__ = ["HELD_OUT", "run_trial", "tracker_of"]
 
 HELD_OUT, ITERATION = "held_out", "iteration"
 """What a trial reports to Tune."""

@@ -18,8 +18,6 @@ from services.sweeps.folders import SweepFolder, TrialResult
 from services.sweeps.trial import HELD_OUT, ITERATION, run_trial, tracker_of
 from services.tracking import tracking_uri
 
-__all__ = ["tune_trials"]
-
 # They tell of files that are not written, and of a lost process by its traceback.
 for _name in ("analysis.experiment_analysis", "execution.tune_controller"):
     logging.getLogger(f"ray.tune.{_name}").setLevel(logging.CRITICAL)

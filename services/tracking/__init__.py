@@ -24,8 +24,6 @@ os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")  # it would speak into the live screen
 os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
 
-__all__ = ["DEFAULT_URI", "Tracker", "in_words", "introduce", "redacted", "tracking_uri"]
-
 DEFAULT_URI = "sqlite:///mlflow.db"
 RETRY_SECONDS = 10.0
 LINGER_SECONDS = 1.0

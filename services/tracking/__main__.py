@@ -20,8 +20,6 @@ from services.tracking import in_words, redacted, tracking_uri
 from services.tracking.delivery import Delivery
 from services.tracking.spool import Artifact, Spool
 
-__all__ = ["Arguments", "run"]
-
 REPORT = "report"
 """In a run's folder, and among its artifacts."""
 

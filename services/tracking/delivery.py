@@ -19,8 +19,6 @@ from services.tracking.spool import Line, read_spool
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-__all__ = ["IDENTITY", "RUN_TAG", "BusyError", "Delivery", "Identity", "IdentityError"]
-
 RUN_TAG = "dmil.run"
 """The tag by which a run is found again whose id was never noted."""
 PARENT_TAG = "mlflow.parentRunId"

@@ -5,8 +5,6 @@ from typing import NamedTuple
 
 from services.tracking.spool import read_spool
 
-__all__ = ["Origin", "read_metrics", "read_origin"]
-
 
 class Origin(NamedTuple):
     """What a run was made of."""

@@ -4,8 +4,6 @@ import json
 from collections.abc import Sequence
 from urllib.parse import quote, urlsplit, urlunsplit
 
-__all__ = ["comparison_link", "how_to_look", "run_link"]
-
 LOCAL = "http://127.0.0.1:5000"
 """Where ``mlflow ui`` serves what is no server itself."""
 

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from mlflow.entities import LoggedModel, Run
     from mlflow.models import ModelSignature
 
-__all__ = ["CHECKPOINT_TAG", "checkpoint_in", "log_model", "models_of"]
-
 NAME = "model"
 CODE = Path(__file__).with_name("imitator.py")
 CHECKPOINT_TAG = "checkpoint"

@@ -9,8 +9,6 @@ from jaxtyping import Float32, Int64
 from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.errors import UserError, shown
 
-__all__ = ["PackingError", "Question", "packed", "unpacked"]
-
 
 class PackingError(UserError):
     """An input of the model that is no support set with an observation."""

@@ -12,8 +12,6 @@ from services.tracking.spool import Artifact, Ended, Line, Measured, Trained
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-__all__ = ["METRICS_PER_CALL", "next_batch", "send"]
-
 T = TypeVar("T")
 METRICS_PER_CALL = 1000
 """What MLflow takes in one batch."""

@@ -13,9 +13,6 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, Validat
 from dmil_core.errors import UserError
 from services.storage.files import room_for
 
-__all__ = ["Artifact", "Ended", "Example", "Line", "Measured", "Spool", "SpoolError", "Trained", "read_spool"]
-
-
 LONGEST_LINE = 2**22
 
 

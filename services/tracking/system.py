@@ -11,8 +11,6 @@ from services.tracking import Tracker
 if TYPE_CHECKING:
     from mlflow.system_metrics.metrics.base_metrics_monitor import BaseMetricsMonitor
 
-__all__ = ["recording_system"]
-
 SECONDS = 10.0
 """Between two samples, as MLflow has it."""
 

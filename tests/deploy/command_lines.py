@@ -14,7 +14,8 @@ import click
 
 from dmil_core.errors import UserError
 from services import meta_train, tune_sweep
-from services.cli.arguments import defaults_from, parse
+from services.cli.arguments import parse
+from services.cli.composition import defaults_from
 from tests.deploy.manifests import DEPLOY, ask
 
 PROGRAMS = {"ray", "mlflow", "python", "weed", "prometheus", "pg_isready", "wget"}

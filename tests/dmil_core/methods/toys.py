@@ -16,8 +16,6 @@ from dmil_core.networks import Parameters, flatten, unflatten
 from dmil_core.outer_loop import OuterState, OuterStep, Practise, group_gradient, groups, tasks_of
 from dmil_core.seeding import stream
 
-__all__ = ["STEPS", "Recorded", "act_along", "meta_trained", "practise", "record", "recovered", "training_sets"]
-
 STEPS, SPEED = 40, 0.05
 DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0]])
 GAINS = 0.1 * np.array([[[0.0, 1.0], [-1.0, 0.0]], [[0.0, -1.0], [1.0, 0.0]]])

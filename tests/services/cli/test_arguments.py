@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from dmil_core.configs import PRESETS
-from services.cli.arguments import PROGRAMS, ConfigError, config_from, parse
+from services.cli.arguments import PROGRAMS, ConfigError, parse
+from services.cli.composition import config_from
 from services.meta_train import Arguments, run
 
 

@@ -3,6 +3,7 @@
 import pytest
 
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
+from services.distributed import simulation_worker
 from services.distributed.simulation_worker import SimulationWorker
 from services.suites.base import Environment
 from services.suites.metaworld import MetaWorldSuite
@@ -34,7 +35,7 @@ def test_environments_are_built_once_and_used_again():
 
 
 def test_the_task_longest_unused_makes_room(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(simulation, "ENVIRONMENTS_KEPT", 2)
+    monkeypatch.setattr(simulation_worker, "ENVIRONMENTS_KEPT", 2)
     suite = CountingSuite()
     worker = SimulationWorker(suite)
     for task in ("reach", "push", "reach", "sweep", "reach", "push"):

@@ -10,7 +10,7 @@ import yaml
 from mutations import Odd, json_bytes, mutated_bytes, mutated_value
 
 from dmil_core.configs import PRESETS, ExperimentConfig
-from services.cli.arguments import config_from
+from services.cli.composition import config_from
 from services.evaluation.results import AdaptationResult, EpisodeResult, read_rows, write_rows
 from services.tracking.history import read_metrics
 

@@ -11,7 +11,7 @@ from playwright.sync_api import Browser, Page
 
 from dmil_core.configs import preset_of
 from services import meta_train
-from services.cli.arguments import checked
+from services.cli.composition import checked
 from services.cli.yaml_files import merged
 from services.demonstrations.store import DemoStore, data_root
 from services.distributed.runner import LocalRunner

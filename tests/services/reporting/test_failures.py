@@ -17,8 +17,8 @@ from services.experiments.replay import Seen
 from services.reporting.drawing import Picture
 from services.reporting.failures import FAILED, SOLVED, draw_episodes, failures_of_run, worst_tasks
 from services.reporting.page import Commands, DataTable, Prose, Section
+from services.rollouts.episodes import Episode
 from services.rollouts.recording import Footage, Watched
-from services.rollouts.trials import Episode
 from services.suites.base import Measure
 from services.suites.rendering import RenderingError
 from tests.services.reporting.made_runs import TASKS, make_run

@@ -5,7 +5,8 @@ import pytest
 
 from dmil_core.configs import ExperimentConfig, preset_of
 from services import meta_train
-from services.cli.arguments import checked, defaults_from, parse
+from services.cli.arguments import parse
+from services.cli.composition import checked, defaults_from
 from services.reporting.settings import flags, nearest_preset
 
 

@@ -5,8 +5,8 @@ import pytest
 
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
 from dmil_core.methods.base import Decision, Flat
+from services.rollouts.episodes import demonstrate, rollout
 from services.rollouts.recording import Film, Watched, watch, watch_expert
-from services.rollouts.trials import demonstrate, rollout
 from services.suites.base import build_env, measure_of
 from services.suites.registry import open_suite
 from services.suites.rendering import RenderingError

@@ -8,7 +8,8 @@ import pytest
 from dmil_core.configs import DemonstrationConfig, EvaluationConfig, SuiteConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import Decision, Flat, SubSkillUse
-from services.rollouts.trials import demonstrate, imitation_error, record, rollout, trials
+from services.rollouts.episodes import demonstrate, record, rollout
+from services.rollouts.trials import imitation_error, trials
 from services.suites.base import Environment, Expert
 from services.suites.metaworld import MetaWorldSuite
 

@@ -1,7 +1,7 @@
 """An expert is verified by its own demonstrations."""
 
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
-from services.rollouts.trials import demonstrate
+from services.rollouts.episodes import demonstrate
 from services.rollouts.verification import verify
 from services.suites.metaworld import MetaWorldSuite
 

@@ -8,7 +8,7 @@ import pytest
 
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError
-from services.rollouts.trials import demonstrate
+from services.rollouts.episodes import demonstrate
 from services.rollouts.verification import verify
 from services.suites.inverse_kinematics import Arm, Pose, bounded_least_squares, pose_error
 from services.suites.kitchen import NAMES, SPLITS, KitchenSuite, KitchenTask, UnknownKitchenTaskError, chains, replay

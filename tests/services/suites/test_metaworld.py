@@ -10,7 +10,7 @@ from metaworld.sawyer_xyz_env import SawyerXYZEnv
 
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
 from dmil_core.seeding import stream_seed
-from services.rollouts.trials import demonstrate
+from services.rollouts.episodes import demonstrate
 from services.suites.metaworld import (
     SPLITS,
     TASKS,

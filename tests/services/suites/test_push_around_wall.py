@@ -9,7 +9,7 @@ from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from metaworld.policies import SawyerPickPlaceWallV3Policy, SawyerPushV3Policy
 
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
-from services.rollouts.trials import demonstrate
+from services.rollouts.episodes import demonstrate
 from services.suites.base import Environment, Expert
 from services.suites.metaworld import MetaWorldSuite, SeededEpisodes
 from services.suites.metaworld_speed import fast_environment

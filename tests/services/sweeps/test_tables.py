@@ -177,7 +177,7 @@ def test_suites_may_stand_in_the_rows(tmp_path: Path) -> None:
 
 
 def test_a_search_is_ranked_and_its_best_is_a_file_of_settings(tmp_path: Path) -> None:
-    from services.cli.arguments import config_from
+    from services.cli.composition import config_from
 
     space = {"method.sub_skills": [2, 3, 4, 5], "method.inner_learning_rate": {"low": 1e-3, "high": 1e-2}}
     suite = {"train_tasks": ["reach"], "test_tasks": ["push"]}

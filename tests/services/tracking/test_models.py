@@ -27,6 +27,7 @@ from services.tracking.delivery import Identity
 from services.tracking.imitator import POLICIES_KEPT, Imitator
 from services.tracking.models import checkpoint_in, models_of
 from services.tracking.packing import PackingError, packed
+from tests.services.tracking import old_imitator
 
 GUIDE = Path(__file__).parents[3] / "docs" / "mlflow.md"
 STEPS = FineTuning(1, 0.01)
@@ -59,10 +60,11 @@ def policy_of(checkpoint: Checkpoint, support):
 
 
 @pytest.mark.parametrize("method", OURS)
-def test_it_acts_as_the_adapted_policy_step_by_step(untrained, method: str):
+@pytest.mark.parametrize("kind", [Imitator, old_imitator.Imitator], ids=["now", "as logged at version 0.1"])
+def test_it_acts_as_the_adapted_policy_step_by_step(untrained, kind: type[Imitator], method: str):
     checkpoint, support = untrained(method)
     context = PythonModelContext({"checkpoint": str(checkpoint.path)}, {"action_dim": 4})
-    imitator = Imitator()
+    imitator = kind()
     imitator.load_context(context)
     policy = policy_of(checkpoint, support)
     memory, remembered = policy.start(1), None

@@ -1,7 +1,7 @@
 """Digests of what smoke runs come to, to tell whether a change of the code changes what it computes.
 
-`python -m tests.services.same_bits RUNS` trains every run of `RUNS` below in a folder and prints their digests, to be
-put into ``same_bits.json`` beside, under the kind of processor that they are true for.
+`python -m tests.services.experiments.same_bits FOLDER` trains every run of `RUNS` in a folder and prints their digests,
+to be put into ``same_bits.json`` beside, under the kind of processor that they hold for.
 """
 
 import hashlib

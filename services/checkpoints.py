@@ -1,0 +1,5 @@
+"""The place that models in MLflow import `Checkpoint` from if they were logged before version 0.2; it goes with 0.4."""
+
+from services.storage.checkpoints import Checkpoint
+
+__all__ = ["Checkpoint"]

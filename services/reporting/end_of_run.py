@@ -1,0 +1,56 @@
+"""What a run writes, records and shows at its end, besides its page."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from services.cli.progress import console
+from services.evaluation.summary import AGAINST_COLLAPSE, Summary, rates, table, table_markdown, write_summary
+from services.storage.checkpoints import Checkpoint
+from services.tracking import Tracker
+
+PAGE = "report.html"
+"""In a run's report folder."""
+
+
+def write_report(summary: Summary, folder: Path) -> None:
+    """Write ``summary.json``, and the folder ``report`` with the tables."""
+    write_summary(summary, folder / "summary.json")
+    report = folder / "report"
+    report.mkdir(exist_ok=True)
+    (report / "table.md").write_text(table_markdown(summary))
+
+
+def publish(tracker: Tracker, summary: Summary, folder: Path) -> None:
+    """Record the success rates, of each task and in all, the report and the episodes on the MLflow run."""
+    metrics = rates(summary.rows, summary.sub_skills)
+    metrics |= {f"seconds/{phase}": spent for phase, spent in summary.seconds.items()}
+    tracker.metrics(Checkpoint(Path(summary.checkpoint)).manifest.iteration, metrics, anew=True)
+    tracker.tags({"mlflow.note.content": table_markdown(summary)})
+    for path, destination in (
+        (folder / "report", "report"),
+        (folder / "summary.json", None),
+        (folder / "episodes.jsonl", None),
+    ):
+        tracker.artifact(path, destination)
+
+
+def show(summary: Summary, whereabouts: Sequence[str] = ()) -> None:
+    """Print the table, the use of sub-skills, the seconds, and where everything is, the MLflow run too if given."""
+    console.print(table(summary))
+    for split, use in summary.sub_skills.items():
+        shares = ", ".join(f"{share:.2f}" for share in use.share)
+        console.print(
+            f"{split}: sub-skills take {shares} of the states; {use.in_use_per_task:.1f} in use per task; "
+            f"the high level agrees with the best-fitting sub-skill on {use.agreement:.2f}"
+        )
+    if summary.collapsed:
+        console.print(
+            f"warning: one sub-skill takes nearly all states, so the hierarchy is not used; {AGAINST_COLLAPSE}"
+        )
+    if failed := {task: count for task, count in summary.failed_attempts.items() if count}:
+        console.print("failed expert attempts: " + ", ".join(f"{task} {count}" for task, count in failed.items()))
+    console.print("seconds: " + ", ".join(f"{phase} {spent:.0f}" for phase, spent in summary.seconds.items()))
+    page = Path(summary.report) / PAGE
+    console.print(f"checkpoint: {summary.checkpoint}\nreport: {page if page.exists() else summary.report}")
+    for line in whereabouts:
+        console.print(line, markup=False, soft_wrap=True)
