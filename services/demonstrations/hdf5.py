@@ -1,0 +1,94 @@
+"""HDF5 files of somebody else's, read as data alone: nothing outside the file, and no more than it can hold."""
+
+import errno
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from dmil_core.demonstrations import DemonstrationError
+
+MAX_ARRAYS = 2**32
+"""Bytes of all arrays that are read from one file together."""
+MAX_RATIO = 200
+"""Bytes that one byte of a compressed file may stand for, beyond `FREE_BYTES`."""
+FREE_BYTES = 2**26
+
+
+class PlainFile:
+    """The arrays of an open HDF5 file that lie in the file itself.
+
+    HDF5 can name arrays that lie elsewhere: links to other files, raw external storage, virtual arrays. None of these
+    is followed, and an array is refused before memory is taken for it if the arrays read by then would be larger than
+    `MAX_ARRAYS` or than `MAX_RATIO` times the file.
+    """
+
+    def __init__(self, file: h5py.File, size: int) -> None:
+        """Read from `file`, which has `size` bytes on disk."""
+        self._file = file
+        self._left = min(MAX_ARRAYS, FREE_BYTES + MAX_RATIO * size)
+
+    def names(self, group: str = "/") -> list[str]:
+        """Return the names in a group, in alphabetical order; none for an array or where there is nothing."""
+        found = self._member(group)
+        return sorted(found) if isinstance(found, h5py.Group) else []
+
+    def has(self, name: str) -> bool:
+        """Return whether there is something under a path of the file."""
+        return self._member(name) is not None
+
+    def array(self, name: str, *, axes: int | None = None) -> np.ndarray:
+        """Return an array of numbers.
+
+        Args:
+            name: its path in the file.
+            axes: how many it must have; any number but none at all, if not given.
+
+        Raises:
+            DemonstrationError: if there is none, it lies outside the file, holds no numbers, or is too large.
+        """
+        array = self._member(name)
+        if not isinstance(array, h5py.Dataset) or array.is_virtual or array.external:
+            raise DemonstrationError(f"{name}: got no array of this file; wanted one")
+        if array.dtype.kind not in "fiub" or (array.ndim < 1 if axes is None else array.ndim != axes):
+            wanted = "numbers with an axis of steps" if axes is None else f"numbers with {axes} axes"
+            raise DemonstrationError(f"{name}: got {array.dtype} of the shape {array.shape}; wanted {wanted}")
+        if array.nbytes > self._left:
+            raise DemonstrationError(
+                f"{name}: got {array.nbytes} bytes, where {self._left} are left of what this file may hold; wanted at "
+                f"most {MAX_ARRAYS} bytes in all, and {MAX_RATIO} for each byte on disk; split the file"
+            )
+        self._left -= array.nbytes
+        return array[()]
+
+    def _member(self, path: str) -> h5py.Group | h5py.Dataset | None:
+        """Return what lies under a path, reached by hard links only; they cannot lead out of the file."""
+        found: h5py.Group | h5py.Dataset | None = self._file
+        for part in filter(None, path.split("/")):
+            if not isinstance(found, h5py.Group) or part not in found:
+                return None
+            if not isinstance(found.get(part, getlink=True), h5py.HardLink):
+                raise DemonstrationError(f"{path}: got a link; wanted the array itself, in this file")
+            member = found[part]
+            found = member if isinstance(member, h5py.Group | h5py.Dataset) else None
+        return found
+
+
+@contextmanager
+def open_plain(path: Path) -> Iterator[PlainFile]:
+    """Open an HDF5 file for reading.
+
+    Raises:
+        OSError: if it is no regular file, such as a pipe, or no HDF5 file.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe without a writer would wait for ever
+    with os.fdopen(descriptor, "rb") as content:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(errno.EINVAL, "is no regular file", str(path))
+        with h5py.File(content, "r") as file:
+            yield PlainFile(file, status.st_size)
