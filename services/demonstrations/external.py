@@ -1,29 +1,35 @@
 """Demonstrations that somebody else has recorded: Minari data sets, D4RL's HDF5 files, npz files (docs/data.md)."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, NamedTuple
 
-import h5py
 import numpy as np
-from gymnasium.spaces import Box
 from jaxtyping import Float32
-from minari import MinariDataset
 from minari.storage import get_dataset_path
+from pydantic import BaseModel, Field
 
 from dmil_core.demonstrations import Demonstration, DemonstrationError, digest
+from services.demonstrations.hdf5 import PlainFile, open_plain
 from services.demonstrations.npz import read_npz
 from services.demonstrations.store import TaskDemonstrations, data_root
-from services.storage.files import inside
+from services.storage.files import inside, read_file
 from services.suites.base import TaskSuite
 
 FORMS = ("minari", "hdf5", "npz")
 """What data sets may be: an id of Minari's, a file as D4RL has them, a file of arrays."""
-MOST_BYTES = 2**32
-"""Of an HDF5 file's arrays."""
+MAX_METADATA = 2**20
+"""Bytes of a Minari data set's metadata."""
 VERSION = re.compile(r"-v\d+$")
 """What a Minari id ends with."""
+
+
+class _Metadata(BaseModel):
+    """What is read of Minari's ``metadata.json``."""
+
+    total_episodes: Annotated[int, Field(ge=1, le=10**6)]
+    data_format: str = "hdf5"
 
 
 class Recording(NamedTuple):
@@ -76,8 +82,8 @@ def read_recordings(place: str) -> list[Recording]:
         return _read_minari(path) if form == "minari" else _read_hdf5(Path(path))
     except DemonstrationError as error:
         raise DemonstrationError(f"{place}: {error}") from error
-    # What h5py and Minari raise of files that are not what they look like.
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError, AssertionError) as error:
+    # What h5py raises of files that are not what they look like.
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
         raise DemonstrationError(
             f"{place}: got {type(error).__name__}, {error}; wanted a data set as docs/data.md describes"
         ) from error
@@ -120,6 +126,7 @@ def misfits(demonstration: Demonstration, suite: TaskSuite) -> Iterator[str]:
 
 
 def _read_minari(dataset_id: str) -> list[Recording]:
+    """Read a Minari data set without Minari, which would make the environment that the metadata name."""
     folder = inside(data_root(), dataset_id) / "data"
     if not folder.exists():
         folder = get_dataset_path(dataset_id) / "data"
@@ -127,48 +134,50 @@ def _read_minari(dataset_id: str) -> list[Recording]:
         raise DemonstrationError(
             f"got nothing at {folder}, nor in {data_root()}; wanted a data set; minari download {dataset_id}"
         )
-    data = MinariDataset(folder)
-    if not isinstance(data.action_space, Box):
-        raise DemonstrationError(f"actions: got the space {data.action_space}; wanted a Box")
-    recordings = []
-    for episode in data.iterate_episodes():
-        steps = len(episode.actions)
-        success = episode.infos.get("success") if isinstance(episode.infos, dict) else None
-        recordings.append(
-            Recording(
-                _flat(episode.observations)[:steps],
-                np.asarray(episode.actions, np.float32),
-                float(np.sum(episode.rewards)),
-                None if success is None else bool(np.any(success)),
-            )
-        )
-    return recordings
+    metadata = _Metadata.model_validate_json(read_file(folder / "metadata.json", MAX_METADATA))
+    if metadata.data_format != "hdf5":
+        raise DemonstrationError(f"data_format: got {metadata.data_format}; wanted hdf5; store the data set as that")
+    with open_plain(folder / "main_data.hdf5") as file:
+        return [_episode(file, f"episode_{index}") for index in range(metadata.total_episodes)]
 
 
-def _flat(observations: Any) -> Float32[np.ndarray, "steps obs_dim"]:
-    if isinstance(observations, Mapping):
-        return np.concatenate([_flat(observations[name]) for name in sorted(observations)], axis=1)
-    if not isinstance(observations, np.ndarray) or observations.dtype.kind not in "fiu":
+def _episode(file: PlainFile, name: str) -> Recording:
+    actions = file.array(f"{name}/actions", axes=2)
+    observations = _observations(file, f"{name}/observations")
+    if len(observations) not in (len(actions), len(actions) + 1):
         raise DemonstrationError(
-            f"observations: got {type(observations).__name__}; wanted arrays of numbers (Box), or dictionaries of them"
+            f"{name}: got {len(observations)} observations of {len(actions)} actions; wanted one more, or as many"
         )
+    success = file.array(f"{name}/infos/success") if file.has(f"{name}/infos/success") else None
+    return Recording(
+        observations[: len(actions)],
+        actions.astype(np.float32),
+        float(file.array(f"{name}/rewards", axes=1).sum()),
+        None if success is None else bool(success.any()),
+    )
+
+
+def _observations(file: PlainFile, name: str) -> Float32[np.ndarray, "steps obs_dim"]:
+    if parts := file.names(name):
+        return np.concatenate([_observations(file, f"{name}/{part}") for part in parts], axis=1)
+    observations = file.array(name)
     return observations.reshape(len(observations), -1).astype(np.float32)
 
 
 def _read_hdf5(path: Path) -> list[Recording]:
-    with h5py.File(path) as file:
-        observations, actions = (_array(file, name, 2) for name in ("observations", "actions"))
+    with open_plain(path) as file:
+        observations, actions = (file.array(name, axes=2) for name in ("observations", "actions"))
         if len(observations) != len(actions):
             raise DemonstrationError(
                 f"got {len(observations)} observations and {len(actions)} actions; wanted as many of both"
             )
         ends = np.zeros(len(actions), bool)
-        for name in {"terminals", "timeouts"} & set(file):
-            marks = _array(file, name, 1).astype(bool)
+        for name in filter(file.has, ("terminals", "timeouts")):
+            marks = file.array(name, axes=1).astype(bool)
             if len(marks) != len(ends):
                 raise DemonstrationError(f"{name}: got {len(marks)} for {len(ends)} actions; wanted one each")
             ends |= marks
-        rewards = _array(file, "rewards", 1) if "rewards" in file else None
+        rewards = file.array("rewards", axes=1) if file.has("rewards") else None
     if not ends.any():
         raise DemonstrationError("got neither terminals nor timeouts that mark an episode's last step; wanted either")
     cuts = np.flatnonzero(ends) + 1  # what follows the last mark is no whole episode
@@ -182,15 +191,3 @@ def _read_hdf5(path: Path) -> list[Recording]:
         )
         for part in parts
     ]
-
-
-def _array(file: h5py.File, name: str, axes: int) -> np.ndarray:
-    array = file[name]
-    if not isinstance(array, h5py.Dataset) or array.is_virtual or array.external or array.file != file:
-        raise DemonstrationError(f"{name}: got no array of this file; wanted one")
-    if array.dtype.kind not in "fiub" or array.ndim != axes or array.nbytes > MOST_BYTES:
-        raise DemonstrationError(
-            f"{name}: got {array.dtype} of the shape {array.shape}; wanted numbers with {axes} axes, at most "
-            f"{MOST_BYTES} bytes"
-        )
-    return array[()]

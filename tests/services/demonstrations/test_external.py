@@ -1,5 +1,6 @@
 """Other people's data sets: read as they are, split where their episodes end, refused in words."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -159,3 +160,28 @@ def test_what_does_not_fit_the_suite_is_told_with_its_episode(root: Path):
     with pytest.raises(DemonstrationError, match=r"a\.hdf5: episode 1: .*observations at step 1 is not finite"):
         demonstrations("slide", place, KITCHEN, 10)
     assert len(demonstrations("slide", place, KITCHEN, 1).demonstrations) == 1, "what is not used may be spoilt"
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("entry_point", ["os:mkdir", "gymnasium.envs.registration:make", "nowhere:at_all"])
+def test_what_a_minari_data_set_names_is_not_run(root: Path, entry_point: str):
+    """With and without its spaces, for want of which Minari makes the environment."""
+    place = minari_set("kitchen/slide-v2")
+    metadata = root / "minari/kitchen/slide-v2/data/metadata.json"
+    spec = {"id": "Seen-v0", "entry_point": entry_point, "kwargs": {"path": str(root / "made")}}
+    for without in ((), ("observation_space", "action_space")):
+        content = json.loads(metadata.read_text()) | {"env_spec": json.dumps(spec)}
+        metadata.write_text(json.dumps({key: value for key, value in content.items() if key not in without}))
+        assert len(read_recordings(place)) == len(EPISODES)
+    assert not (root / "made").exists()
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_private_file_is_not_read_as_observations(root: Path):
+    place = minari_set("kitchen/slide-v2")
+    (root / "secret").write_bytes(bytes(1000))
+    with h5py.File(root / "minari/kitchen/slide-v2/data/main_data.hdf5", "a") as file:
+        del file["episode_1/observations"]
+        file.create_dataset("episode_1/observations", (8, 60), "u1", external=[(str(root / "secret"), 0, 480)])
+    with pytest.raises(DemonstrationError, match="episode_1/observations: got no array of this file"):
+        read_recordings(place)
