@@ -26,7 +26,7 @@ from dmil_core.networks import unflatten
 from dmil_core.outer_loop import add, group_gradient
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
-from services.distributed.chunking import pack
+from services.distributed.chunking import to_chunks
 from services.distributed.learner import Learner
 from services.distributed.ray_meta_training import FAN_IN, RayMetaTraining
 from services.distributed.ray_runner import RayRunner
@@ -123,7 +123,7 @@ def measured_costs(plan: Plan, rounds: int) -> Costs:
     torch.set_num_threads(1)
     slots = slot_seconds(plan, rounds)
     parameters = plan.state.parameters
-    gradients, freight = [parameters.copy() for _ in range(FAN_IN)], pack(parameters)
+    gradients, chunks = [parameters.copy() for _ in range(FAN_IN)], to_chunks(parameters)
     learner = Learner(plan.state, plan.settings)
     training = RayMetaTraining(plan, 1)
     try:
@@ -143,11 +143,11 @@ def measured_costs(plan: Plan, rounds: int) -> Costs:
         return Costs(
             slot=float(np.mean(slots)),
             spread=float(np.std(slots) / np.mean(slots)),
-            step=least(rounds, lambda: learner.step(freight), time.process_time),
+            step=least(rounds, lambda: learner.step(chunks), time.process_time),
             call=least(rounds, one_by_one) / CALLS,
             submit=least(rounds, many) / CALLS,
             buffer=parameters.nbytes,
-            store=parameters.nbytes / least(rounds, lambda: ray.put(freight)),
+            store=parameters.nbytes / least(rounds, lambda: ray.put(chunks)),
             add=FAN_IN * parameters.nbytes / least(rounds, lambda: add(gradients), time.process_time),
             demonstrations=sum(
                 demonstration.observations.nbytes + demonstration.actions.nbytes

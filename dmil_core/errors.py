@@ -27,43 +27,43 @@ class RunError(RuntimeError):
 
 
 class WorkError(RuntimeError):
-    """A Python error in a piece of pure work, with all that is needed to do that piece again, alone."""
+    """A Python error in a work item, with all that is needed to run the item again, alone."""
 
-    def __init__(self, where: str, problem: str, trace: str, piece: Mapping[str, str | int]) -> None:
-        """Tell of an error.
+    def __init__(self, label: str, problem: str, trace: str, key: Mapping[str, str | int]) -> None:
+        """Describe an error.
 
         Args:
-            where: which piece of work it was, in words.
-            problem: the last line of the traceback.
-            trace: all of it.
-            piece: what names the piece among all.
+            label: name of the work item in messages.
+            problem: last line of the traceback.
+            trace: the whole traceback.
+            key: what identifies the item among all.
         """
-        super().__init__(where, problem, trace, piece)  # all, for it travels between processes
-        self.where, self.problem, self.trace, self.piece = where, problem, trace, piece
+        super().__init__(label, problem, trace, key)  # all, for it travels between processes
+        self.label, self.problem, self.trace, self.key = label, problem, trace, key
 
     def __str__(self) -> str:
-        """Say what is told in one line."""
-        return f"{self.where}: {self.problem}"
+        """Return the item and the problem in one line."""
+        return f"{self.label}: {self.problem}"
 
 
 @contextmanager
-def piece_of_work(where: str, **piece: str | int) -> Iterator[None]:
-    """Do a piece of pure work inside.
+def as_work_error(label: str, **key: str | int) -> Iterator[None]:
+    """Raise an error inside as a `WorkError`, unless it is one already or the user's mistake.
 
     Args:
-        where: which one it is, in words.
-        piece: what names it among all.
+        label: name of the work item in messages.
+        key: what identifies the item among all.
 
     Raises:
-        WorkError: for any error that is not the user's.
+        WorkError: names the item.
     """
     try:
         yield
-    except UserError:
+    except (UserError, WorkError):
         raise
     except Exception as error:
         problem = traceback.format_exception_only(error)[-1].strip()
-        raise WorkError(where, problem, traceback.format_exc(), piece) from error
+        raise WorkError(label, problem, traceback.format_exc(), key) from error
 
 
 class _Shortened(reprlib.Repr):

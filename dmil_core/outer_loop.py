@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration
-from dmil_core.errors import piece_of_work
+from dmil_core.errors import as_work_error
 from dmil_core.meta_gradient import TaskGradient, tree_sum
 from dmil_core.methods.base import MetaLearner, Policy, PractisingLearner, Rollout
 from dmil_core.networks import Parameters
@@ -25,7 +25,7 @@ Practise: TypeAlias = Callable[[Policy, str, int, int], Sequence[Rollout]]
 """Lets a policy act in a task's environments: policy, task, seed, and steps in all, of whole episodes but the last."""
 
 
-class SpoiltSlot(NamedTuple):
+class NonfiniteSlot(NamedTuple):
     """A slot with a loss or a gradient that is not finite."""
 
     slot: int
@@ -39,7 +39,7 @@ class GroupGradient(NamedTuple):
 
     gradient: Float32[np.ndarray, " size"]
     metrics: list[Mapping[str, float]]
-    spoilt: list[SpoiltSlot]
+    nonfinite: list[NonfiniteSlot]
     """Where there is one, no number of the gradient's is finite."""
 
 
@@ -115,10 +115,10 @@ def group_gradient(
     Raises:
         WorkError: for a Python error in one of them, which is named.
     """
-    terms, metrics, spoilt = [], [], []
+    terms, metrics, nonfinite = [], [], []
     for slot in slots:
         task = tasks[slot]
-        with piece_of_work(slot_in_words(iteration, slot, task, seed), iteration=iteration, slot=slot):
+        with as_work_error(slot_label(iteration, slot, task, seed), iteration=iteration, slot=slot):
             material = method.sample(demonstrations[task], iteration, stream(seed, "batch", iteration, slot))
             if isinstance(method, PractisingLearner) and (steps := method.practice_steps(iteration)):
                 assert practise is not None
@@ -127,14 +127,14 @@ def group_gradient(
                 material = method.with_practice(material, rollouts)
             result = method.task_gradient(parameters, material)
         if not _finite(result):
-            spoilt.append(SpoiltSlot(slot, task, tuple(material.ids)))
+            nonfinite.append(NonfiniteSlot(slot, task, tuple(material.ids)))
         terms.append(result.gradient)
         metrics.append(result.metrics)
-    gradient = torch.full_like(terms[0], torch.nan) if spoilt else tree_sum(terms)
-    return GroupGradient(gradient.numpy(), metrics, spoilt)
+    gradient = torch.full_like(terms[0], torch.nan) if nonfinite else tree_sum(terms)
+    return GroupGradient(gradient.numpy(), metrics, nonfinite)
 
 
-def slot_in_words(iteration: int, slot: int, task: str, seed: int) -> str:
+def slot_label(iteration: int, slot: int, task: str, seed: int) -> str:
     """Name a slot in messages, where iterations count from 1."""
     return f"iteration {iteration + 1}, slot {slot}, task {task}, seed {seed}"
 

@@ -9,8 +9,8 @@ import torch
 from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import MetaLearner
 from dmil_core.networks import unflatten
-from dmil_core.outer_loop import SpoiltSlot, add, group_gradient
-from services.distributed.chunking import Freight, pack, unpack
+from dmil_core.outer_loop import NonfiniteSlot, add, group_gradient
+from services.distributed.chunking import Chunks, from_chunks, to_chunks
 from services.distributed.simulation_worker import SimulationWorker
 from services.distributed.timing import Span
 from services.suites.base import TaskSuite
@@ -21,7 +21,7 @@ class BlockReport(NamedTuple):
 
     metrics: list[Mapping[str, float]]
     """Of each of its slots."""
-    spoilt: list[SpoiltSlot]
+    nonfinite: list[NonfiniteSlot]
     span: Span
 
 
@@ -46,12 +46,12 @@ class AdaptationWorker:
 
     def gradient(
         self,
-        parameters: Freight,
+        parameters: Chunks,
         iteration: int,
         tasks: Sequence[str],
         block: Sequence[Sequence[int]],
         before: Sequence[Any] = (),
-    ) -> tuple[BlockReport, Freight]:
+    ) -> tuple[BlockReport, Chunks]:
         """Return the sum of a block's gradients, which is all that need travel, and its report.
 
         Args:
@@ -65,23 +65,23 @@ class AdaptationWorker:
             WorkError: for a Python error in one of the slots.
         """
         began = time.perf_counter()
-        own = unflatten(torch.from_numpy(unpack(parameters)), self._shapes)
+        own = unflatten(torch.from_numpy(from_chunks(parameters)), self._shapes)
         results = [
             group_gradient(self._method, self._demonstrations, own, self._seed, iteration, tasks, slots, self._practise)
             for slots in block
         ]
         gradient = add([result.gradient for result in results])
         metrics = [slot for result in results for slot in result.metrics]
-        spoilt = [slot for result in results for slot in result.spoilt]
-        report = BlockReport(metrics, spoilt, Span(began, time.perf_counter()))
+        nonfinite = [slot for result in results for slot in result.nonfinite]
+        report = BlockReport(metrics, nonfinite, Span(began, time.perf_counter()))
         if not before:
-            return report, pack(gradient)
+            return report, to_chunks(gradient)
         import ray  # the local runner, which never comes here, does without
 
-        _, total = self.add(*ray.get(list(before)), pack(gradient))
+        _, total = self.add(*ray.get(list(before)), to_chunks(gradient))
         return report, total
 
-    def add(self, *gradients: Freight) -> tuple[Span, Freight]:
+    def add(self, *gradients: Chunks) -> tuple[Span, Chunks]:
         """Return the sum of neighbouring gradients of the tree, and when it was made."""
         began = time.perf_counter()
         total = [add(pieces) for pieces in zip(*gradients, strict=True)]

@@ -1,4 +1,4 @@
-"""How a big flat vector travels between actors: as one object, in pieces that are cheap to write."""
+"""Chunking of the big flat vectors that travel between actors, so that they are cheap to write."""
 
 from collections.abc import Sequence
 from typing import TypeAlias
@@ -6,19 +6,19 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float32
 
-Freight: TypeAlias = Sequence[Float32[np.ndarray, " _"]]
-"""A flat vector in consecutive pieces."""
+Chunks: TypeAlias = Sequence[Float32[np.ndarray, " _"]]
+"""A flat vector in consecutive chunks."""
 
-PIECE = 2**18
-"""Numbers in a piece, 1 MiB. Ray starts six threads to copy a longer one into its store: where every core computes
+CHUNK_LENGTH = 2**18
+"""Numbers in a chunk, 1 MiB. Ray starts six threads to copy a longer one into its store: where every core computes
 already, that takes longer than the copy."""
 
 
-def pack(vector: Float32[np.ndarray, " size"]) -> Freight:
-    """Return `vector` in pieces, as views."""
-    return [vector[first : first + PIECE] for first in range(0, len(vector), PIECE)]
+def to_chunks(vector: Float32[np.ndarray, " size"]) -> Chunks:
+    """Return `vector` in chunks, as views."""
+    return [vector[first : first + CHUNK_LENGTH] for first in range(0, len(vector), CHUNK_LENGTH)]
 
 
-def unpack(freight: Freight) -> Float32[np.ndarray, " size"]:
-    """Copy the pieces, which may lie in memory that others read, into one vector of one's own."""
-    return np.concatenate(freight)
+def from_chunks(chunks: Chunks) -> Float32[np.ndarray, " size"]:
+    """Concatenate the chunks, which may lie in shared memory, into a vector of its own."""
+    return np.concatenate(chunks)

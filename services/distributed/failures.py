@@ -56,10 +56,10 @@ def keeping_failures(
         folder.mkdir(parents=True, exist_ok=True)
         kept = checkpoint()
         failure = Failure(
-            where=error.where,
+            where=error.label,
             problem=error.problem,
             trace=error.trace,
-            piece=dict(error.piece),
+            piece=dict(error.key),
             checkpoint=None if kept is None else str(kept.resolve()),
             config=config,
             versions=library_versions(),

@@ -8,7 +8,7 @@ import torch
 
 from dmil_core.configs import TrainingConfig
 from dmil_core.outer_loop import OuterState, OuterStep
-from services.distributed.chunking import Freight, pack, unpack
+from services.distributed.chunking import Chunks, from_chunks, to_chunks
 from services.distributed.timing import Span
 
 
@@ -35,14 +35,14 @@ class Learner:
         self._skip = skip_nonfinite
         self._step = OuterStep(state, training)
 
-    def parameters(self) -> tuple[float, Freight]:
+    def parameters(self) -> tuple[float, Chunks]:
         """Return the time on this machine's clock, and the current parameters, flat."""
-        return time.perf_counter(), pack(self._step.parameters.numpy().copy())
+        return time.perf_counter(), to_chunks(self._step.parameters.numpy().copy())
 
-    def step(self, gradient: Freight) -> tuple[StepReport, Freight]:
+    def step(self, gradient: Chunks) -> tuple[StepReport, Chunks]:
         """Step by the sum of all gradients; return the report and the new parameters."""
         began = time.perf_counter()
-        norm = self._step(unpack(gradient))
+        norm = self._step(from_chunks(gradient))
         if self._skip and not math.isfinite(norm):
             self._step.skip()
         ended, parameters = self.parameters()

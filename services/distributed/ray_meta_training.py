@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dmil_core.errors import WorkError
-from dmil_core.outer_loop import OuterState, blocks, groups, slot_in_words
+from dmil_core.outer_loop import OuterState, blocks, groups, slot_label
 from services.cli.progress import console
 from services.distributed.adaptation_worker import AdaptationWorker, BlockReport
 from services.distributed.errors import DeadlyCallError, LostError
@@ -186,8 +186,8 @@ class RayMetaTraining:
         timing = Timing.of(self._ready, work, stepped.span)
         self._done, self._ready = self._done + 1, stepped.span.ended
         slots = [metrics for report in reports for metrics in report.metrics]
-        spoilt = [slot for report in reports for slot in report.spoilt]
-        return Iteration(self._done, slots, spoilt, stepped.gradient_norm, timing)
+        nonfinite = [slot for report in reports for slot in report.nonfinite]
+        return Iteration(self._done, slots, nonfinite, stepped.gradient_norm, timing)
 
     def state(self) -> OuterState:
         """Fetch the learner's state."""
@@ -221,7 +221,7 @@ class RayMetaTraining:
             raise error
         parameters, iteration, tasks, block, _ = call.arguments
         for slot in (slot for group in block for slot in group):
-            where = slot_in_words(iteration, slot, tasks[slot], self._plan.seed)
+            where = slot_label(iteration, slot, tasks[slot], self._plan.seed)
             alone = self._pool.submit("gradient", parameters, iteration, tasks, [[slot]], returns=2, label=where)
             try:
                 self._pool.result(alone)

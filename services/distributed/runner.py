@@ -12,7 +12,7 @@ import torch
 from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import MetaLearner
-from dmil_core.outer_loop import OuterState, SpoiltSlot, groups, tasks_of
+from dmil_core.outer_loop import NonfiniteSlot, OuterState, groups, tasks_of
 from services.cli.live_view import Workers
 from services.distributed.adaptation_worker import AdaptationWorker
 from services.distributed.learner import Learner
@@ -50,7 +50,7 @@ class Iteration(NamedTuple):
     """Outer steps done, this one included."""
     slots: list[Mapping[str, float]]
     """The metrics of each slot."""
-    spoilt: list[SpoiltSlot]
+    nonfinite: list[NonfiniteSlot]
     """Those with a loss or a gradient that is not finite."""
     gradient_norm: float
     """Before clipping."""
@@ -194,7 +194,7 @@ class LocalMetaTraining:
                 stepped, self._parameters = self._learner.step(gradient)
             timing = Timing.of(self._ready, {0: [report.span]}, stepped.span)
             self._next, self._ready = self._next + 1, stepped.span.ended
-            yield Iteration(self._next, report.metrics, report.spoilt, stepped.gradient_norm, timing)
+            yield Iteration(self._next, report.metrics, report.nonfinite, stepped.gradient_norm, timing)
 
     def state(self) -> OuterState:
         """Return the learner's state."""

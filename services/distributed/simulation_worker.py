@@ -9,7 +9,7 @@ from jaxtyping import Float32
 
 from dmil_core.configs import DemonstrationConfig, EvaluationConfig
 from dmil_core.demonstrations import Demonstration
-from dmil_core.errors import piece_of_work
+from dmil_core.errors import as_work_error
 from dmil_core.methods.base import Method, Policy, Rollout
 from dmil_core.networks import unflatten
 from dmil_core.seeding import stream_seed
@@ -52,7 +52,7 @@ class SimulationWorker:
         steps, attempts = config.steps(task, self._suite.horizon), []
         for number in numbers:
             seed = stream_seed(config.seed, "demonstration", task, number)
-            with piece_of_work(f"task {task}, attempt {number}, seed {seed}", task=task, attempt=number):
+            with as_work_error(f"task {task}, attempt {number}, seed {seed}", task=task, attempt=number):
                 attempts.append(demonstrate(expert, env, seed, steps, config))
         return attempts
 
@@ -62,7 +62,7 @@ class SimulationWorker:
         Raises:
             WorkError: for a Python error in one of them.
         """
-        with piece_of_work(f"task {task}, seeds {seeds[0]} to {seeds[-1]}", task=task, seed=seeds[0]):
+        with as_work_error(f"task {task}, seeds {seeds[0]} to {seeds[-1]}", task=task, seed=seeds[0]):
             return verify(self._suite, task, seeds, noise)
 
     def practise(self, policy: Policy, task: str, seed: int, steps: int) -> list[Rollout]:
@@ -85,7 +85,7 @@ class SimulationWorker:
         Raises:
             WorkError: for a Python error in it.
         """
-        with piece_of_work(f"{trial.in_words}, seed {seed}", **trial.piece):
+        with as_work_error(f"{trial.in_words}, seed {seed}", **trial.piece):
             envs = self._environments(trial.task, len(trial.episodes))
             own = unflatten(torch.tensor(parameters), shapes)
             return try_out(method, own, trial, held_out, envs, self._suite.horizon, evaluation, seed)
@@ -105,7 +105,7 @@ class SimulationWorker:
         Raises:
             WorkError: for a Python error in it.
         """
-        with piece_of_work(f"{trial.in_words}, seed {seed}", **trial.piece):
+        with as_work_error(f"{trial.in_words}, seed {seed}", **trial.piece):
             return imitate(method, unflatten(torch.tensor(parameters), shapes), trial, held_out, evaluation)
 
 

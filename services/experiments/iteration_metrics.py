@@ -43,6 +43,6 @@ def nonfinite_in_words(iteration: Iteration) -> str:
     """Return which slots of an iteration have a loss or a gradient that is not finite."""
     slots = "; ".join(
         f"slot {slot.slot}, task {slot.task}, demonstrations {', '.join(dict.fromkeys(slot.demonstrations))}"
-        for slot in iteration.spoilt
+        for slot in iteration.nonfinite
     )
     return f"iteration {iteration.number}: a loss or a gradient is not finite in {slots or 'the sum over all slots'}"

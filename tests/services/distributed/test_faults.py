@@ -127,9 +127,9 @@ def test_a_slot_that_ends_its_workers_is_named(small: Experiment, data):
         meta_training = runner.meta_train(deadly)
         with pytest.raises(WorkError, match=r"iteration \d, slot \d, task push, seed 0: .*3 workers ended") as error:
             follow(meta_training)
-        piece = error.value.piece
-        assert deadly.tasks(int(piece["iteration"]))[int(piece["slot"])] == "push"
-        assert meta_training.state().iteration == piece["iteration"]
+        key = error.value.key
+        assert deadly.tasks(int(key["iteration"]))[int(key["slot"])] == "push"
+        assert meta_training.state().iteration == key["iteration"]
 
 
 @pytest.mark.slow
@@ -302,9 +302,9 @@ def test_no_failure_is_told_as_a_users_mistake(complaint, workplace: Path):
 
 
 @pytest.fixture
-def spoilt(data: dict[str, TaskDemonstrations], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> DemoStore:
+def nonfinite(data: dict[str, TaskDemonstrations], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> DemoStore:
     """A store in which one demonstration of push has an action whose square is too large for a float."""
-    store = DemoStore(workplace / "spoilt")
+    store = DemoStore(workplace / "nonfinite")
     for task, dataset in data.items():
         attempts = []
         for index, demonstration in enumerate(dataset.demonstrations):
@@ -318,7 +318,7 @@ def spoilt(data: dict[str, TaskDemonstrations], workplace: Path, monkeypatch: py
     return store
 
 
-@pytest.mark.usefixtures("spoilt")
+@pytest.mark.usefixtures("nonfinite")
 def test_numbers_that_are_not_finite_stop_a_run_before_the_step(train, capsys: pytest.CaptureFixture[str]):
     arguments = ["--preset", "ml10-smoke", "--runner", "local", "--name", "run", "--training.iterations", "40"]
     assert exit_code(meta_train.run, arguments) == 1
@@ -335,7 +335,7 @@ def test_numbers_that_are_not_finite_stop_a_run_before_the_step(train, capsys: p
     assert f"iteration {iteration}: a loss or a gradient is not finite" in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("spoilt")
+@pytest.mark.usefixtures("nonfinite")
 def test_a_run_may_go_on_without_the_steps_that_are_not_finite(train, capsys: pytest.CaptureFixture[str]):
     finished = train("run", "--training.iterations", "20", "--on-nonfinite", "skip")
     assert finished.manifest.iteration == 20

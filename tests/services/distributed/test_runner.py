@@ -11,7 +11,7 @@ import pytest
 from dmil_core.outer_loop import groups
 from services.demonstrations.store import DemoStore
 from services.distributed.adaptation_worker import AdaptationWorker
-from services.distributed.chunking import PIECE, pack, unpack
+from services.distributed.chunking import CHUNK_LENGTH, from_chunks, to_chunks
 from services.distributed.learner import Learner
 from services.distributed.ray_meta_training import RayMetaTraining
 from services.distributed.runner import Runner
@@ -149,13 +149,13 @@ def test_the_learner_receives_one_gradient(
         assert follow(meta_training).numbers == list(range(1, ITERATIONS + 1))
 
 
-@pytest.mark.parametrize("size", [1, PIECE, PIECE + 1, 3 * PIECE])
-def test_what_is_packed_arrives_as_it_was(size: int):
+@pytest.mark.parametrize("size", [1, CHUNK_LENGTH, CHUNK_LENGTH + 1, 3 * CHUNK_LENGTH])
+def test_chunks_concatenate_to_the_vector(size: int):
     vector = np.random.default_rng(0).normal(size=size).astype(np.float32)
-    packed = pack(vector)
-    assert all(len(piece) <= PIECE for piece in packed)
-    assert np.array_equal(unpack(packed), vector)
-    assert not any(np.shares_memory(piece, unpack(packed)) for piece in packed)
+    chunks = to_chunks(vector)
+    assert all(len(chunk) <= CHUNK_LENGTH for chunk in chunks)
+    assert np.array_equal(from_chunks(chunks), vector)
+    assert not any(np.shares_memory(chunk, from_chunks(chunks)) for chunk in chunks)
 
 
 def test_the_time_of_an_iteration_is_divided_up_whole():
