@@ -108,7 +108,7 @@ class Run:
         if uri is not None:
             folder.mkdir()
             os.environ["MLFLOW_TRACKING_URI"] = uri
-            self.tracker = Tracker(folder, "benchmark", console.print)
+            self.tracker = Tracker(folder, "benchmark")
             self.tracker.identify()
 
     def go_on(self, count: int) -> None:

@@ -8,7 +8,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -79,7 +78,7 @@ class Arguments:
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     given, folder, checkpoint = _read(arguments)
-    with replicated(folder, partial(console.print, markup=False)):
+    with replicated(folder):
         _carry_out(given, folder, checkpoint)
 
 
@@ -91,7 +90,7 @@ def _carry_out(given: Arguments, folder: Path, checkpoint: Checkpoint | None) ->
     folder.mkdir(parents=True, exist_ok=True)
     write_file(folder / MARK, config.model_dump_json(indent=1) + "\n")
     console.print(f"run: {folder}")
-    tracker = Tracker(folder, f"dmil-{config.suite.name}", partial(console.print, markup=False))
+    tracker = Tracker(folder, f"dmil-{config.suite.name}")
     status = "FAILED"
     try:
         introduce(tracker, config)

@@ -8,7 +8,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -64,7 +63,7 @@ def run(arguments: Sequence[str]) -> None:
     sweep = _resumed(given) if given.resume is not None else _begun(given)
     clock = Clock()
     console.print(f"sweep: {sweep.path}")
-    tracker = Tracker(sweep.path, f"dmil-{sweep.record.name}", partial(console.print, markup=False))
+    tracker = Tracker(sweep.path, f"dmil-{sweep.record.name}")
     status = "FAILED"
     try:
         _introduce(tracker, sweep)

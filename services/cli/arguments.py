@@ -12,7 +12,7 @@ import tyro
 from pydantic import ValidationError
 
 from dmil_core.errors import RunError, UserError, explain
-from services.cli.progress import console
+from services.cli.progress import console_logging
 from services.cli.yaml_files import ConfigError
 
 T = TypeVar("T")
@@ -23,7 +23,7 @@ Quiet = Annotated[
         "messages only warnings, results and errors."
     ),
 ]
-"""The flag ``--quiet`` of programs that take long; `parse` sees to it."""
+"""The flag ``--quiet`` of programs that take long; `exit_code` applies it."""
 PROGRAMS = {
     "meta-train": "collect demonstrations, meta-train, evaluate",
     "collect-demos": "let the scripted experts make demonstrations",
@@ -56,15 +56,13 @@ def parse(program: type[T], description: str, arguments: Sequence[str], defaults
     """
     module = program.__module__ if program.__module__ != "__main__" else f"services.{Path(sys.argv[0]).stem}"
     try:
-        given = tyro.cli(program, prog=f"python -m {module}", args=arguments, description=description, default=defaults)
+        return tyro.cli(program, prog=f"python -m {module}", args=arguments, description=description, default=defaults)
     except ValidationError as error:
         raise ConfigError(explain(error)) from error
-    console.terse = getattr(given, "quiet", False)
-    return given
 
 
 def exit_code(program: Callable[[Sequence[str]], None], arguments: Sequence[str]) -> int:
-    """Run a program and return its exit code.
+    """Run a program, with what is logged on the console, and return its exit code.
 
     2 for the user's mistake, 1 for what stops a run otherwise, 130 and 143 for Ctrl-C and SIGTERM.
     """
@@ -74,14 +72,17 @@ def exit_code(program: Callable[[Sequence[str]], None], arguments: Sequence[str]
         received.append(number)
         raise KeyboardInterrupt  # as Ctrl-C; of a class of our own nothing would be left where Ray waits
 
-    signal.signal(signal.SIGTERM, terminate)
+    before = signal.signal(signal.SIGTERM, terminate)
     try:
-        program(arguments)
+        with console_logging(quiet="--quiet" in arguments):
+            program(arguments)
     except (UserError, RunError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2 if isinstance(error, UserError) else 1
     except KeyboardInterrupt:
         return 143 if received else 130
+    finally:
+        signal.signal(signal.SIGTERM, before)
     return 0
 
 

@@ -1,9 +1,11 @@
 """How far a run is: one calm screen on a terminal, plain lines every few seconds elsewhere."""
 
+import logging
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import TracebackType
 
 from rich.console import Console
@@ -21,21 +23,44 @@ LATELY_SECONDS = 30.0
 class Output(Console):
     """The terminal, or whatever the programs' output goes to."""
 
-    terse = False
-    """Whether plain lines are wanted in place of the screen, and of messages only warnings, results and errors."""
+    plain = False
+    """Whether plain lines are wanted in place of the screen."""
 
     @property
     def live(self) -> bool:
         """Whether there is a screen that can be drawn over."""
-        return self.is_interactive and self.file.isatty() and not self.terse
-
-    def note(self, message: str) -> None:
-        """Print a message that is neither a warning nor a result."""
-        if not self.terse:
-            self.print(message, markup=False)
+        return self.is_interactive and self.file.isatty() and not self.plain
 
 
 console = Output(highlight=False, soft_wrap=not sys.stdout.isatty(), width=None if sys.stdout.isatty() else 160)
+
+
+class _ConsoleHandler(logging.Handler):
+    """Prints warnings and errors behind their level, and all other records as they are."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a record."""
+        level = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
+        console.print(f"{level}{record.getMessage()}", markup=False)
+
+
+@contextmanager
+def console_logging(*, quiet: bool) -> Iterator[None]:
+    """Print what the modules of ``services`` log to the console, for as long as a program runs.
+
+    Args:
+        quiet: print warnings only, and plain lines in place of the live screen.
+    """
+    logger = logging.getLogger("services")
+    handlers, level, plain = logger.handlers, logger.level, console.plain
+    logger.handlers = [_ConsoleHandler()]  # in place of those there are: each record is printed once
+    console.plain = quiet
+    logger.setLevel(logging.WARNING if quiet else logging.INFO)
+    try:
+        yield
+    finally:
+        logger.handlers, console.plain = handlers, plain
+        logger.setLevel(level)
 
 
 class Bar:

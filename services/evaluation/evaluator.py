@@ -1,5 +1,6 @@
 """Evaluations of checkpoints: who is tried out on what, the rows that come of it, and those made on the way."""
 
+import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -14,7 +15,6 @@ from dmil_core.methods.base import Standardised
 from dmil_core.methods.registry import method_type
 from dmil_core.settings import sub_skills_of
 from services.cli.live_view import Tally
-from services.cli.progress import console
 from services.demonstrations.store import TaskDemonstrations
 from services.distributed.failures import keeping_failures
 from services.distributed.metrics import EPISODES, SUCCESS_RATE, SUCCESSES, Meter
@@ -26,6 +26,8 @@ from services.storage.checkpoints import Checkpoint, Checkpoints
 from services.storage.provenance import library_versions
 from services.suites.base import Split, TaskSuite
 from services.tracking import Tracker
+
+logger = logging.getLogger(__name__)
 
 
 class Tallies:
@@ -230,7 +232,7 @@ class Evaluations:
         found = cells(evaluation.episodes, evaluation.best_score, self._evaluator.config.method)
         self._tracker.metrics(iteration, rates(found, sub_skill_use(evaluation.adaptations)))
         in_words = "; ".join(f"{cell.split} {cell.shots}-shot {cell.success_rate:.3f}" for cell in found)
-        console.note(f"success rates after {iteration} iterations: {in_words}")
+        logger.info(f"success rates after {iteration} iterations: {in_words}")
 
 
 def write_evaluation(evaluation: Evaluation, folder: Path) -> None:

@@ -1,5 +1,6 @@
 """One experiment, put together from its config once, for all programs: collect, meta-train, evaluate."""
 
+import logging
 import time
 from collections import deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -19,7 +20,7 @@ from dmil_core.networks import Parameters, flatten, unflatten
 from dmil_core.outer_loop import OuterState
 from dmil_core.seeding import stream
 from services.cli.live_view import Figures
-from services.cli.progress import Bar, console
+from services.cli.progress import Bar
 from services.demonstrations.collection import DemonstrationCollection
 from services.demonstrations.store import DemoStore, TaskDemonstrations
 from services.distributed.failures import keeping_failures
@@ -35,6 +36,8 @@ from services.storage.provenance import library_versions
 from services.suites.base import Split, TaskSuite
 from services.suites.registry import open_suite
 from services.tracking import Tracker
+
+logger = logging.getLogger(__name__)
 
 RunnerKind = Literal["ray", "local"]
 OnNonfinite = Literal["stop", "skip"]
@@ -220,7 +223,7 @@ class Experiment:
             arrays = {name: tensor.numpy() for name, tensor in parameters.items()}
             path = checkpoints.save(state, arrays, method.constants(), manifest)
             runner.meter.record(CHECKPOINT_TIME, time.time())
-            console.note(f"checkpoint: {path}")
+            logger.info(f"checkpoint: {path}")
             return path
 
         evaluations = Evaluations(
@@ -268,7 +271,7 @@ class Experiment:
                         if on_nonfinite == "stop":
                             save_now()
                             raise NonFiniteError(told, checkpoints.folder.parent)
-                        console.print(f"warning: {told}; the step is not taken")
+                        logger.warning(f"{told}; the step is not taken")
                     else:
                         losses.append(metrics["loss"])
                     tracker.metrics(done, {name: value for name, value in metrics.items() if np.isfinite(value)})
@@ -276,7 +279,7 @@ class Experiment:
                     recent.append(metrics)
                     bar.advance(1)
                     if warning := collapse.look(done, metrics):
-                        console.print(f"warning: {warning}")
+                        logger.warning(warning)
                         tracker.tags({"warning.collapse": warning})
                     evaluations.look()
                     last = done == settings.iterations

@@ -1,6 +1,7 @@
 """Checkpoints: safetensors and a JSON manifest with a digest of every file, whole or not there at all."""
 
 import json
+import logging
 import math
 import os
 import shutil
@@ -18,9 +19,10 @@ from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import UserError, explain, shown
 from dmil_core.networks import flatten
 from dmil_core.outer_loop import OuterState
-from services.cli.progress import console
 from services.storage.checksums import checked_file, listing, sha256
 from services.storage.files import inside, read_file, room_for, sync
+
+logger = logging.getLogger(__name__)
 
 MANIFEST, SEAL = "manifest.json", "manifest.sha256"
 PARAMETERS, OPTIMISER, CONSTANTS = "parameters.safetensors", "optimiser.safetensors", "constants.safetensors"
@@ -175,7 +177,7 @@ class Checkpoints:
                 complaints.append(" ".join(str(error).splitlines()))
             else:
                 if complaints:
-                    console.print(f"warning: {' | '.join(complaints)}; taking {path} instead", markup=False)
+                    logger.warning(f"{' | '.join(complaints)}; taking {path} instead")
                 return found
         damaged = f"{len(paths)} checkpoints, none of them whole" if paths else "no checkpoint"
         raise CheckpointError("\n".join([f"{self.folder}: got {damaged}; wanted one; start the run anew", *complaints]))

@@ -1,13 +1,16 @@
 """A copy of a run, or of what a sweep trained, in a storage that all machines reach: another goes on from there."""
 
+import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from services.storage.checkpoints import FILES, SEAL
 from services.storage.remote import Storage, given_storage
+
+logger = logging.getLogger(__name__)
 
 NAMED = r"iteration-\d{7,}"
 IDENTITY = "mlflow_run.json"
@@ -106,16 +109,14 @@ def restored(folder: Path) -> bool:
 
 
 @contextmanager
-def replicated(
-    folder: Path, say: Callable[[str], None], place: str = "runs", *, restore: bool = False
-) -> Iterator[None]:
+def replicated(folder: Path, place: str = "runs", *, restore: bool = False) -> Iterator[None]:
     """Keep a copy of a run's folder while the run goes on, if ``DMIL_STORAGE`` names a storage.
 
-    A storage that does not answer never stops a run; the copy is brought up to date when it answers again.
+    A storage that does not answer never stops a run; the copy is brought up to date when it answers again. One
+    warning is logged when the storage fails, one if the copy is not whole at the end.
 
     Args:
         folder: of the run.
-        say: where messages go: one when the storage fails, one if the copy is not whole at the end.
         place: the folder of the storage that the copy is in.
         restore: fetch beforehand what the storage has further.
 
@@ -133,7 +134,9 @@ def replicated(
             replica.copy()
         except Exception as error:  # noqa: BLE001  whatever a storage raises, the run goes on
             if not complained.is_set():
-                say(f"{storage.url} does not take the copy of {folder} ({type(error).__name__}: {error}); going on")
+                logger.warning(
+                    f"{storage.url} does not take the copy of {folder} ({type(error).__name__}: {error}); going on"
+                )
             complained.set()
             return False
         return True
@@ -145,9 +148,9 @@ def replicated(
     if restore:
         try:
             if replica.restore():
-                say(f"{folder}: fetched from {storage.url}")
+                logger.info(f"{folder}: fetched from {storage.url}")
         except Exception as error:  # noqa: BLE001  as above
-            say(f"{storage.url} does not give {folder} ({type(error).__name__}: {error}); going on without")
+            logger.warning(f"{storage.url} does not give {folder} ({type(error).__name__}: {error}); going on without")
     thread = threading.Thread(target=work, name="replica", daemon=True)
     thread.start()
     try:
@@ -157,4 +160,4 @@ def replicated(
         thread.join(FAREWELL_SECONDS)
         began = time.monotonic()
         if thread.is_alive() or not copied():
-            say(f"{storage.url} has no whole copy of {folder} ({time.monotonic() - began:.0f} s tried)")
+            logger.warning(f"{storage.url} has no whole copy of {folder} ({time.monotonic() - began:.0f} s tried)")

@@ -1,10 +1,10 @@
 """One trial of a sweep, in the process that Tune gives it: the same experiment as ``meta_train``."""
 
+import logging
 import os
 import time
 from collections.abc import Mapping
 from contextlib import redirect_stdout
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 
 from dmil_core.errors import RunError, UserError
 from services.cli.composition import with_evaluation
-from services.cli.progress import Clock, console
+from services.cli.progress import Clock, console_logging
 from services.demonstrations.store import DemoStore
 from services.distributed.ray_runner import RayRunner
 from services.evaluation.results import EpisodeResult, read_rows
@@ -28,6 +28,8 @@ from services.sweeps.folders import TRAINED, SweepFolder, TrialResult, evaluated
 from services.sweeps.settings import PlannedTrial
 from services.tracking import Tracker, introduce
 from services.tracking.history import read_metrics
+
+logger = logging.getLogger(__name__)
 
 HELD_OUT, ITERATION = "held_out", "iteration"
 """What a trial reports to Tune."""
@@ -59,8 +61,7 @@ def tracker_of(sweep: SweepFolder, trial: PlannedTrial, kind: type[Tracker] = Tr
     """Return what records a trial as a child of the sweep's MLflow run."""
     folder = sweep.of_trial(trial.name)
     folder.mkdir(parents=True, exist_ok=True)
-    say = partial(console.print, markup=False)
-    return kind(folder, f"dmil-{sweep.record.name}", say, parent=sweep.path)
+    return kind(folder, f"dmil-{sweep.record.name}", parent=sweep.path)
 
 
 def run_trial(folder: Path, name: str, demonstrations: Path, environment: Mapping[str, str]) -> None:
@@ -83,7 +84,8 @@ def run_trial(folder: Path, name: str, demonstrations: Path, environment: Mappin
     assert isinstance(tracker, ReportingTracker)
     tracker.goes_by = f"{sweep.record.sweep.metric}/meta-testing/"
     status = "KILLED"
-    with (sweep.of_trial(name) / "log.txt").open("a", buffering=1) as log, redirect_stdout(log):
+    log_file = (sweep.of_trial(name) / "log.txt").open("a", buffering=1)
+    with log_file as log, redirect_stdout(log), console_logging(quiet=False):
         try:
             introduce(tracker, trial.config)
             tracker.tags({"sweep": sweep.record.name, "variant": trial.variant, "scale": sweep.record.size})
@@ -92,7 +94,7 @@ def run_trial(folder: Path, name: str, demonstrations: Path, environment: Mappin
         except Exception as error:  # noqa: BLE001  whatever it is, it is shown, and the other trials go on
             status = "FAILED"
             told = str(error) if isinstance(error, UserError | RunError) else f"{type(error).__name__}: {error}"
-            console.print(f"error: {told}", markup=False)
+            logger.error(told)
             tracker.tags({"error": told[:5000]})
             sweep.finish(name, TrialResult(status="failed", error=told))
         finally:
@@ -113,7 +115,7 @@ def _run(sweep: SweepFolder, trial: PlannedTrial, store: DemoStore, tracker: Tra
         tracker.tags({"trained": home.name})
         clock.lap("collect")
         with FileLock(home / ".lock"):  # two sweeps may want it
-            with replicated(home, partial(console.print, markup=False), TRAINED, restore=True):
+            with replicated(home, TRAINED, restore=True):
                 checkpoints = Checkpoints(home / "checkpoints", config.training.checkpoints_kept)
                 checkpoint = _whole(checkpoints, config.training.iterations)
                 if checkpoint is None:
@@ -123,7 +125,7 @@ def _run(sweep: SweepFolder, trial: PlannedTrial, store: DemoStore, tracker: Tra
                     curves = read_metrics(sweep.of_trial(trial.name))
                     write_file(home / "metrics.json", _METRICS.dump_json(curves))
                 else:
-                    console.print(f"trained already: {home}")
+                    logger.info(f"trained already: {home}")
                     _copy_curves(home / "metrics.json", tracker)
             clock.lap("train")
             tasks = [task for split, task in experiment.tasks if split in sweep.record.sweep.splits]

@@ -9,7 +9,7 @@ from ray import tune
 from ray.tune import Callback, RunConfig, TuneConfig
 from ray.tune.schedulers import AsyncHyperBandScheduler, TrialScheduler
 
-from services.cli.progress import Bar, console
+from services.cli.progress import Bar
 from services.demonstrations.store import data_root
 from services.distributed.cluster import cpus
 from services.distributed.errors import NoRoomError
@@ -17,6 +17,8 @@ from services.storage.remote import STORAGE
 from services.sweeps.folders import SweepFolder, TrialResult
 from services.sweeps.trial import HELD_OUT, ITERATION, run_trial, tracker_of
 from services.tracking import tracking_uri
+
+logger = logging.getLogger(__name__)
 
 # They tell of files that are not written, and of a lost process by its traceback.
 for _name in ("analysis.experiment_analysis", "execution.tune_controller"):
@@ -65,7 +67,7 @@ class Progress(Callback):
         """Say that it is begun again."""
         name = trial.config["trial"]
         self._at.pop(name, None)
-        console.print(f"warning: {name}: its process ended; it is begun again", markup=False)
+        logger.warning(f"{name}: its process ended; it is begun again")
 
     def on_trial_error(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
         """Say that its process ended."""
@@ -85,9 +87,9 @@ class Progress(Callback):
         result = self._sweep.result(name)
         told = "stopped early, for others are better" if result is None else result.error or result.status
         if result is not None and result.status == "failed":
-            console.print(f"{name}: {told}", markup=False)
+            logger.error(f"{name}: {told}")
         else:
-            console.note(f"{name}: {told}")
+            logger.info(f"{name}: {told}")
         self._bar.advance(1, self._running())
 
     def _running(self) -> str:

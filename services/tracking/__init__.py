@@ -1,10 +1,11 @@
 """MLflow tracking that never stops a run: records go to a file in the run's folder first, a thread delivers them."""
 
+import logging
 import os
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "60")
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")  # it would speak into the live screen
 os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
+
+logger = logging.getLogger(__name__)
 
 DEFAULT_URI = "sqlite:///mlflow.db"
 RETRY_SECONDS = 10.0
@@ -57,13 +60,14 @@ def in_words(error: Exception) -> str:
 class Tracker:
     """One MLflow run, fed from ``tracking.jsonl`` in the run's folder."""
 
-    def __init__(self, folder: Path, experiment: str, say: Callable[[str], None], parent: Path | None = None) -> None:
+    def __init__(self, folder: Path, experiment: str, parent: Path | None = None) -> None:
         """Open the MLflow run that belongs to a run's folder, or make one as soon as MLflow answers.
+
+        One warning is logged when MLflow does not take records, one if some are left at the end.
 
         Args:
             folder: of the run; a folder that was tracked before continues the same MLflow run.
             experiment: the MLflow experiment's name.
-            say: where messages go: one when MLflow does not take records, one when some are left at the end.
             parent: the folder of the sweep that this run is a trial of.
 
         Raises:
@@ -74,7 +78,7 @@ class Tracker:
         uri = tracking_uri()
         self.uri = redacted(uri)
         """Of MLflow, without secrets."""
-        self._folder, self._say = folder, say
+        self._folder = folder
         Identity.found_or_made(folder, experiment, None if parent is None else Identity.of(parent).tag)
         self._spool = Spool(folder / "tracking.jsonl")
         self._delivery = Delivery(folder, uri)
@@ -180,7 +184,7 @@ class Tracker:
         try:
             self._spool.append("end", Ended.model_validate({"status": status, "time": _now()}))
         except (OSError, RunError) as error:
-            self._say(f"the end of the run is not recorded: {error}")
+            logger.warning(f"the end of the run is not recorded: {error}")
         self._closing.set()
         started = time.monotonic()
         while self._thread.is_alive() and time.monotonic() < started + patience:
@@ -190,7 +194,7 @@ class Tracker:
         self._spool.close()
         left = self.waiting
         if left:
-            self._say(
+            logger.warning(
                 f"{left} of {self._spool.count} MLflow records wait in {self._spool.path}; when MLflow answers again: "
                 f"python -m services.tracking flush {self._folder}"
             )
@@ -214,7 +218,7 @@ class Tracker:
             self._failed = True
             if not self._complained:
                 self._complained = True
-                self._say(
+                logger.warning(
                     f"MLflow at {self.uri} does not take records ({in_words(error)}); training goes on, "
                     f"records wait in {self._spool.path}"
                 )

@@ -21,6 +21,7 @@ from playwright.sync_api import Browser, sync_playwright
 from dmil_core.configs import PRESETS, ExperimentConfig
 from services import meta_train
 from services.cli.arguments import exit_code
+from services.cli.progress import console_logging
 from services.demonstrations.store import DemoStore, TaskDemonstrations
 from services.experiments.experiment import Experiment, open_runner
 from services.storage.checkpoints import Checkpoint, Checkpoints
@@ -28,6 +29,19 @@ from services.storage.checkpoints import Checkpoint, Checkpoints
 PROJECT = Path(__file__).parents[2]
 SECONDS_TO_START = 90
 CHROMIUM = shutil.which("chromium")
+
+
+@pytest.fixture(autouse=True)
+def _console() -> Iterator[None]:
+    """A test that calls a program's `run` reads on the console what was logged, as where the program was started."""
+    with console_logging(quiet=False):
+        yield
+
+
+@pytest.fixture
+def logged(caplog: pytest.LogCaptureFixture) -> Callable[[], list[str]]:
+    """Returns what the modules of ``services`` have logged so far."""
+    return lambda: [record.getMessage() for record in caplog.records if record.name.startswith("services.")]
 
 
 @pytest.fixture(scope="session")
@@ -254,13 +268,10 @@ def complaint(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
 
     def say(program: Callable[[Sequence[str]], None], *arguments: str) -> str:
         capsys.readouterr()
-        before = signal.getsignal(signal.SIGTERM)
         try:
             code = exit_code(program, arguments)
         except SystemExit as end:
             code = end.code
-        finally:
-            signal.signal(signal.SIGTERM, before)
         assert code == 2
         return "".join(capsys.readouterr())
 

@@ -161,7 +161,7 @@ class Refusing(BaseHTTPRequestHandler):
     ("where", "scheme"),
     [("address", "Basic"), ("MLFLOW_TRACKING_PASSWORD", "Basic"), ("MLFLOW_TRACKING_TOKEN", "Bear")],
 )
-def test_a_refused_tracker_tells_no_secret(tmp_path: Path, where: str, scheme: str, wait_for, monkeypatch):
+def test_a_refused_tracker_tells_no_secret(tmp_path: Path, where: str, scheme: str, wait_for, logged, monkeypatch):
     planted = secrets.token_hex(16)
     handler = type("Handler", (Refusing,), {"asked": []})
     server = HTTPServer(("127.0.0.1", 0), handler)
@@ -171,15 +171,14 @@ def test_a_refused_tracker_tells_no_secret(tmp_path: Path, where: str, scheme: s
     if where != "address":
         monkeypatch.setenv("MLFLOW_TRACKING_USERNAME", "user" if "PASSWORD" in where else "")
         monkeypatch.setenv(where, planted)
-    said: list[str] = []
-    tracker = Tracker(tmp_path, "refused", said.append)
-    wait_for(lambda: bool(said), "a refusal", 30)
+    tracker = Tracker(tmp_path, "refused")
+    wait_for(lambda: bool(logged()), "a refusal", 30)
     assert not tracker.close("FINISHED")
     server.shutdown()
     server.server_close()
     assert handler.asked[0].startswith(scheme), "the secret was used"
-    assert not any(planted in text for text in (*said, tracker.uri))
-    assert "403" in said[0]
+    assert not any(planted in text for text in (*logged(), tracker.uri))
+    assert "403" in logged()[0]
     assert all(planted not in path.read_text() for path in tmp_path.iterdir())
 
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import pytest
 
 from services.cli.live_view import Figures
-from services.cli.progress import Bar, Output, console
+from services.cli.progress import Bar, Output
 
 HIDDEN, SHOWN = "\x1b[?25l", "\x1b[?25h"
 """What a terminal is sent to hide its cursor, and to show it again."""
@@ -103,8 +103,7 @@ def test_a_quiet_terminal_gets_lines_and_results(terminal: Terminal):
     assert "checkpoint: runs/run/checkpoints/iteration-0000004" in sent, "it is among the results"
 
 
-def test_where_there_is_no_terminal_there_are_lines(train, capsys: pytest.CaptureFixture[str], monkeypatch):
-    monkeypatch.setattr(console, "terse", False)
+def test_where_there_is_no_terminal_there_are_lines(train, capsys: pytest.CaptureFixture[str]):
     schedule = ["--training.iterations", "4", "--training.checkpoint-every", "2", "--evaluation.every", "2"]
     train("run", *schedule)
     printed = capsys.readouterr().out

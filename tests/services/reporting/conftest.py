@@ -120,7 +120,7 @@ def trained(planar_visits: Path) -> Callable[..., FinishedRun]:
         folder.mkdir(parents=True)
         (folder / "config.json").write_text(config.model_dump_json())
         data = experiment.collect(runner)
-        tracker = Tracker(folder, "test", print)
+        tracker = Tracker(folder, "test")
         experiment.train(runner, data, Checkpoints(folder / "checkpoints", 1), tracker)
         tracker.close("FINISHED")
         return FinishedRun(folder)

@@ -192,6 +192,6 @@ def test_a_storage_that_is_away_is_told_once_and_stops_nothing(workplace: Path, 
 )
 def test_a_url_that_names_no_storage_is_a_mistake(url: str, told: str, monkeypatch, workplace: Path, complaint):
     monkeypatch.setenv(STORAGE, url)
-    with pytest.raises(StorageError), replicated(workplace / "run", print):
+    with pytest.raises(StorageError), replicated(workplace / "run"):
         pass
     assert told in complaint(meta_train.run, "--preset", "ml10-smoke", "--runner", "local")

@@ -116,7 +116,7 @@ def undisturbed(config: ExperimentConfig, data: dict[str, TaskDemonstrations], f
     """Return the parameters that the configuration has when it is trained in this process."""
     folder.mkdir(parents=True)
     experiment = Experiment(config, open_store())
-    tracker = Tracker(folder, "alone", print)
+    tracker = Tracker(folder, "alone")
     with open_runner("local", experiment.suite, None) as runner:
         checkpoint = experiment.train(runner, data, Checkpoints(folder / "checkpoints", 1), tracker)
     tracker.close("FINISHED")

@@ -35,7 +35,7 @@ Delivery(Path(sys.argv[1]), sys.argv[2]).deliver()
 @pytest.mark.usefixtures("no_mlflow")
 def test_what_mlflow_took_before_a_kill_kept_us_from_noting_it_is_there_once(tmp_path: Path, mlflow_file: str):
     (tmp_path / "table.md").write_text("a table")
-    tracker = Tracker(tmp_path, "killed", print)
+    tracker = Tracker(tmp_path, "killed")
     tracker.parameters({"seed": 0})
     for step in range(1, 2501):
         tracker.metrics(step, {"loss": 1 / step, "constant": 1.0})
@@ -73,7 +73,7 @@ def delivered_two(identity: Identity) -> dict[str, object]:
 
 @pytest.mark.usefixtures("no_mlflow")
 def test_who_takes_over_begins_where_the_other_ended(tmp_path: Path, mlflow_file: str):
-    Tracker(tmp_path, "an experiment", print).close("FINISHED")
+    Tracker(tmp_path, "an experiment").close("FINISHED")
     one, other = Delivery(tmp_path, mlflow_file), Delivery(tmp_path, mlflow_file)
     one.deliver()
     one.close()
@@ -86,7 +86,7 @@ def test_who_takes_over_begins_where_the_other_ended(tmp_path: Path, mlflow_file
 def test_a_damaged_identity_is_named(tmp_path: Path, content: str):
     (tmp_path / "mlflow_run.json").write_text(content)
     with pytest.raises(IdentityError, match=r"mlflow_run\.json: got .*delete it") as caught:
-        Tracker(tmp_path, "an experiment", print)
+        Tracker(tmp_path, "an experiment")
     assert isinstance(caught.value, UserError)
 
 
@@ -101,7 +101,7 @@ def test_more_delivered_than_there_is_is_refused(tmp_path: Path):
 @pytest.mark.usefixtures("no_mlflow")
 def test_an_artifact_that_is_gone_does_not_hold_up_the_others(tmp_path: Path, mlflow_file: str):
     (tmp_path / "gone.md").write_text("gone")
-    tracker = Tracker(tmp_path, "an experiment", print)
+    tracker = Tracker(tmp_path, "an experiment")
     tracker.artifact(tmp_path / "gone.md")
     tracker.close("FINISHED")
     (tmp_path / "gone.md").unlink()

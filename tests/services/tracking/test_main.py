@@ -59,7 +59,7 @@ def test_with_no_server_training_ends_and_a_flush_delivers(
 
 @pytest.mark.usefixtures("no_mlflow")
 def test_one_process_delivers_at_a_time(tmp_path: Path, mlflow_file: str, monkeypatch, capsys):
-    Tracker(tmp_path, "an experiment", print).close("FINISHED")
+    Tracker(tmp_path, "an experiment").close("FINISHED")
     one = Delivery(tmp_path, mlflow_file)
     one.deliver()
     monkeypatch.setenv("MLFLOW_TRACKING_URI", mlflow_file)

@@ -43,7 +43,7 @@ def untrained(store: DemoStore, data, tmp_path: Path, no_mlflow: None, monkeypat
         experiment = Experiment(
             config.model_copy(update={"training": config.training.model_copy(update={"iterations": 0})}), store
         )
-        tracker = Tracker(tmp_path, "models", print)
+        tracker = Tracker(tmp_path, "models")
         checkpoint = experiment.train(LocalRunner(experiment.suite), data, Checkpoints(tmp_path / "c", 1), tracker)
         tracker.model(checkpoint.path, experiment.held_out_sets(data)["door-close"][:2])
         tracker.close("FINISHED")
@@ -90,7 +90,7 @@ def test_mlflow_loads_it_without_pickle_and_predicts(untrained, own_mlflow: str,
     checkpoint, support = untrained("dmil")
     monkeypatch.setenv("MLFLOW_TRACKING_URI", own_mlflow)
     for _ in range(2):  # the second one finds it there
-        tracker = Tracker(tmp_path, "models", print)
+        tracker = Tracker(tmp_path, "models")
         tracker.model(checkpoint.path, support[:1])
         assert tracker.close("FINISHED")
     run_id = Identity.of(tmp_path).run_id
@@ -142,7 +142,7 @@ def test_a_checkpoint_that_is_gone_does_not_hold_up_the_others(untrained, mlflow
     checkpoint, _ = untrained("nearest-neighbour")
     (checkpoint.path / "parameters.safetensors").write_bytes(b"")
     monkeypatch.setenv("MLFLOW_TRACKING_URI", mlflow_file)
-    tracker = Tracker(tmp_path, "models", print)
+    tracker = Tracker(tmp_path, "models")
     assert tracker.close("FINISHED")
     client = MlflowClient(mlflow_file)
     run = client.get_run(str(tracker.run_id))

@@ -20,7 +20,7 @@ def test_a_damaged_record_is_named_by_file_and_line(tmp_path: Path, line: str, c
     printed = complaint(tracking_program, "flush", str(tmp_path))
     assert f"{tmp_path / 'tracking.jsonl'}, line 2: got " in printed
     with pytest.raises(SpoolError, match=r"tracking\.jsonl, line 2"):
-        Tracker(tmp_path, "an experiment", print)
+        Tracker(tmp_path, "an experiment")
 
 
 @pytest.mark.parametrize("path", ["/etc/passwd", "../other", "report/../../other"])

@@ -19,7 +19,7 @@ def test_samples_go_to_mlflow_as_its_system_metrics_and_a_resumed_run_goes_on_co
     monkeypatch.setenv("MLFLOW_TRACKING_URI", mlflow_file)
     monkeypatch.setattr(system, "SECONDS", 0.05)
     for _ in range(2):
-        tracker = Tracker(tmp_path, "load", print)
+        tracker = Tracker(tmp_path, "load")
         before = len(records(tmp_path, "system"))
         with recording_system(tracker):
             tracker.metrics(1, {"loss": 0.5})
@@ -36,7 +36,7 @@ def test_samples_go_to_mlflow_as_its_system_metrics_and_a_resumed_run_goes_on_co
 
 @pytest.mark.usefixtures("no_mlflow")
 def test_a_short_run_has_one_sample_at_its_end(tmp_path: Path):
-    tracker = Tracker(tmp_path, "load", print)
+    tracker = Tracker(tmp_path, "load")
     began = time.monotonic()
     with recording_system(tracker):
         pass

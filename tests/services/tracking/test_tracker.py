@@ -24,7 +24,7 @@ from tests.services.tracking.conftest import records, steps
 @pytest.mark.usefixtures("no_mlflow")
 def test_a_metric_is_recorded_once_a_step_unless_it_is_measured_anew(tmp_path: Path):
     for _ in range(2):
-        tracker = Tracker(tmp_path, "an experiment", print)
+        tracker = Tracker(tmp_path, "an experiment")
         tracker.metrics(1, {"loss": 0.5, "nan": float("nan")})
         tracker.metrics(2, {"loss": 0.25})
         tracker.metrics(1, {"loss": 0.75, "speed": 3.0})
@@ -39,15 +39,14 @@ def test_a_metric_is_recorded_once_a_step_unless_it_is_measured_anew(tmp_path: P
 
 
 @pytest.mark.usefixtures("no_mlflow")
-def test_closing_on_a_full_disk_does_not_hide_what_ended_the_run(tmp_path: Path, monkeypatch):
-    said: list[str] = []
-    tracker = Tracker(tmp_path, "an experiment", said.append)
+def test_closing_on_a_full_disk_does_not_hide_what_ended_the_run(tmp_path: Path, monkeypatch, logged):
+    tracker = Tracker(tmp_path, "an experiment")
     usage = files.shutil.disk_usage(tmp_path)._replace(free=0)
     monkeypatch.setattr(files.shutil, "disk_usage", lambda path: usage)
     with pytest.raises(DiskFullError, match=r"needs .* bytes"):
         tracker.tags({"a": "b"})
     assert not tracker.close("FAILED")
-    assert any(text.startswith("the end of the run is not recorded: ") for text in said)
+    assert any(text.startswith("the end of the run is not recorded: ") for text in logged())
 
 
 @pytest.mark.parametrize(
@@ -67,21 +66,20 @@ def test_an_address_is_shown_without_its_secrets(text: str, shown: str):
 
 @pytest.mark.usefixtures("no_mlflow")
 def test_what_was_not_delivered_is_delivered_by_the_next_tracker(
-    tmp_path: Path, mlflow_file: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, mlflow_file: str, monkeypatch: pytest.MonkeyPatch, logged
 ):
-    said: list[str] = []
-    tracker = Tracker(tmp_path, "waiting", said.append)
+    tracker = Tracker(tmp_path, "waiting")
     tracker.parameters({"iterations": 5, "seed": 0})
     tracker.metrics(1, {"loss": 1.0})
     assert not tracker.close("KILLED")
     assert tracker.run_id is None
 
     monkeypatch.setenv("MLFLOW_TRACKING_URI", mlflow_file)
-    again = Tracker(tmp_path, "waiting", said.append)
+    again = Tracker(tmp_path, "waiting")
     again.parameters({"iterations": 9, "seed": 0})
     again.metrics(2, {"loss": 0.5})
     assert again.close("FINISHED")
-    assert len(said) == 2, "one that MLflow fails, one that records wait"
+    assert len(logged()) == 2, "one that MLflow fails, one that records wait"
 
     run = MlflowClient(mlflow_file).get_run(str(again.run_id))
     assert run.data.params == {"iterations": "5", "seed": "0"}
@@ -122,7 +120,7 @@ def test_a_slow_server_is_not_waited_for(
     slow_server: tuple[str, threading.Event], tmp_path: Path, mlflow_file: str, monkeypatch
 ):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", slow_server[0])
-    tracker = Tracker(tmp_path, "slow", print)
+    tracker = Tracker(tmp_path, "slow")
     began = time.monotonic()
     for step in range(1, 101):
         tracker.metrics(step, {"loss": 1 / step})
@@ -182,14 +180,13 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
 
 @pytest.mark.slow
 @pytest.mark.alone
-def test_a_server_takes_records_also_those_of_the_time_it_was_away(server: Server, tmp_path: Path, wait_for):
+def test_a_server_takes_records_also_those_of_the_time_it_was_away(server: Server, tmp_path: Path, wait_for, logged):
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "table.md").write_text("a table")
-    said: list[str] = []
     server.start()
     client = MlflowClient(server.uri)
-    tracker = Tracker(folder, "an experiment", said.append)
+    tracker = Tracker(folder, "an experiment")
     tracker.parameters({f"setting.{number}": number for number in range(150)})
     tracker.metrics(1, {"loss": 0.5})
     run_id = tracker.identify()
@@ -199,14 +196,14 @@ def test_a_server_takes_records_also_those_of_the_time_it_was_away(server: Serve
     server.stop()
     tracker.metrics(2, {"loss": 0.25})
     tracker.tags({"while": "away"})
-    wait_for(lambda: bool(said), "a word about it")
+    wait_for(lambda: bool(logged()), "a word about it")
     tracker.metrics(3, {"loss": 0.125})
     server.start()
     tracker.artifact(folder / "table.md", "report")
     assert tracker.close("FINISHED")
 
-    assert len(said) == 1
-    assert server.uri in said[0]
+    assert len(logged()) == 1
+    assert server.uri in logged()[0]
     run = client.get_run(run_id)
     assert (run.info.status, run.data.tags["while"], len(run.data.params)) == ("FINISHED", "away", 150)
     assert [(point.step, point.value) for point in client.get_metric_history(run_id, "loss")] == [
