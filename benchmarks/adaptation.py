@@ -19,11 +19,11 @@ from torch import Tensor
 from benchmarks.masked_twin import MaskedTwin
 from benchmarks.timing import alternate, write_rows
 from benchmarks.workload import ACTION_DIM, OBS_DIM, as_in_a_run, draw_parameters, draw_steps, settings
-from dmil_core.adaptation import Hierarchy, adapt
 from dmil_core.demonstrations import Demonstration, Standardisation
 from dmil_core.methods.base import FineTuning
-from dmil_core.methods.dmil import DmilPolicy
-from dmil_core.methods.mil import Mil, MilConfig
+from dmil_core.methods.dmil.adaptation import Hierarchy, adapt
+from dmil_core.methods.dmil.method import DmilPolicy
+from dmil_core.methods.mil.method import Mil, MilConfig
 from dmil_core.seeding import stream
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console

@@ -11,8 +11,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from dmil_core.dmil_config import DmilConfig
 from dmil_core.losses import Steps
+from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.networks import Parameters, flatten
 
 Sets: TypeAlias = tuple[Steps, Steps, Steps, Steps]

@@ -25,8 +25,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from benchmarks.masked_twin import MaskedTwin
 from benchmarks.timing import alternate, write_rows
 from benchmarks.workload import OBS_DIM, Size, as_in_a_run, draw_parameters, draw_sets, settings
-from dmil_core.dmil_config import DmilConfig
-from dmil_core.meta_gradient import task_gradient
+from dmil_core.methods.dmil.config import DmilConfig
+from dmil_core.methods.dmil.meta_gradient import task_gradient
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import Bar, console
 

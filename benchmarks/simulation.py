@@ -31,9 +31,9 @@ from rich.table import Table
 from benchmarks.timing import alternate, write_rows
 from dmil_core.configs import PRESETS, EvaluationConfig, SuiteConfig
 from dmil_core.demonstrations import Demonstration
-from dmil_core.dmil_config import DmilConfig
 from dmil_core.methods.base import FineTuning, Policy
-from dmil_core.methods.dmil import Dmil
+from dmil_core.methods.dmil.config import DmilConfig
+from dmil_core.methods.dmil.method import Dmil
 from dmil_core.networks import Parameters, flatten
 from dmil_core.seeding import stream
 from services.cli.arguments import exit_code, parse

@@ -8,9 +8,9 @@ import torch
 from benchmarks.masked_twin import Sets
 from dmil_core.configs import PRESETS
 from dmil_core.demonstrations import Demonstration
-from dmil_core.dmil_config import DmilConfig
 from dmil_core.losses import Steps
-from dmil_core.methods.dmil import Dmil
+from dmil_core.methods.dmil.config import DmilConfig
+from dmil_core.methods.dmil.method import Dmil
 from dmil_core.networks import Parameters, flatten, initialise, unflatten
 from dmil_core.outer_loop import OuterState
 from dmil_core.seeding import stream

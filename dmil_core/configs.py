@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
-from dmil_core.dmil_config import DmilConfig
+from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.registry import config_type
 from dmil_core.settings import Count, MethodConfig, NotNegative, Positive, Seed, Settings, Size
 

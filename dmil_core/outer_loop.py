@@ -12,8 +12,7 @@ from torch import Tensor
 from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import as_work_error
-from dmil_core.meta_gradient import TaskGradient, tree_sum
-from dmil_core.methods.base import MetaLearner, Policy, PractisingLearner, Rollout
+from dmil_core.methods.base import MetaLearner, Policy, PractisingLearner, Rollout, TaskGradient
 from dmil_core.networks import Parameters
 from dmil_core.seeding import stream, stream_seed
 
@@ -80,6 +79,13 @@ def blocks(groups: Sequence[range], workers: int) -> list[list[range]]:
     while size < len(groups) if workers == 1 else -(-len(groups) // (2 * size)) >= BLOCKS_PER_WORKER * workers:
         size *= 2
     return [list(groups[first : first + size]) for first in range(0, len(groups), size)]
+
+
+def tree_sum(terms: Sequence[Tensor]) -> Tensor:
+    """Add `terms` pairwise, neighbours first: the same bits whoever computed which term, and when."""
+    while len(terms) > 1:
+        terms = [sum(terms[index + 1 : index + 2], terms[index]) for index in range(0, len(terms), 2)]
+    return terms[0]
 
 
 def add(gradients: Sequence[Float32[np.ndarray, " size"]]) -> Float32[np.ndarray, " size"]:

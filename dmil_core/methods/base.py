@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float, Float32, Int64
+from torch import Tensor
 
 from dmil_core.demonstrations import Demonstration, Standardisation
-from dmil_core.meta_gradient import TaskGradient
 from dmil_core.networks import Parameters
 from dmil_core.settings import MethodConfig
 
@@ -117,6 +117,13 @@ class Method(Protocol):
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> Policy:
         """Return the policy adapted to the support demonstrations of one task; `parameters` stay as they are."""
         ...
+
+
+class TaskGradient(NamedTuple):
+    """One task's contribution to the outer step, flat in the parameters' order, and what to show of it."""
+
+    gradient: Float[Tensor, " size"]
+    metrics: Mapping[str, float]
 
 
 @runtime_checkable

@@ -5,13 +5,13 @@ from typing import Any
 
 from dmil_core.errors import UserError, shown
 from dmil_core.methods.base import Standardised
-from dmil_core.methods.behaviour_cloning import BehaviourCloning, PerTask
-from dmil_core.methods.dmil import Dmil
-from dmil_core.methods.mil import Mil
-from dmil_core.methods.mlsh import Mlsh
-from dmil_core.methods.nearest_neighbour import NearestNeighbour
-from dmil_core.methods.option_gail import OptionGail, OptionGailOffline
-from dmil_core.methods.pemirl import Pemirl
+from dmil_core.methods.behaviour_cloning.method import BehaviourCloning, PerTask
+from dmil_core.methods.dmil.method import Dmil
+from dmil_core.methods.mil.method import Mil
+from dmil_core.methods.mlsh.method import Mlsh
+from dmil_core.methods.nearest_neighbour.method import NearestNeighbour
+from dmil_core.methods.option_gail.method import OptionGail, OptionGailOffline
+from dmil_core.methods.pemirl.method import Pemirl
 from dmil_core.settings import MethodConfig
 
 ENTRY_POINTS = "dmil.methods"

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from dmil_core.dmil_config import DmilConfig
+from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.settings import MethodConfig
 from services.suites.base import Split
 

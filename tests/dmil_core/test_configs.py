@@ -13,7 +13,7 @@ from dmil_core.configs import (
     SuiteConfig,
     TrainingConfig,
 )
-from dmil_core.dmil_config import DmilConfig
+from dmil_core.methods.dmil.config import DmilConfig
 
 NAN, INF = float("nan"), float("inf")
 

@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmil_core.configs import TrainingConfig
-from dmil_core.meta_gradient import tree_sum
-from dmil_core.outer_loop import BLOCKS_PER_WORKER, OuterState, OuterStep, add, blocks
+from dmil_core.outer_loop import BLOCKS_PER_WORKER, OuterState, OuterStep, add, blocks, tree_sum
 
 
 def gradients_of(seed: int, count: int) -> list[np.ndarray]:

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.nn import functional
 
-from dmil_core.adaptation import Hierarchy
 from dmil_core.losses import OutputLoss, behaviour_cloning_loss, high_level_loss
+from dmil_core.methods.dmil.adaptation import Hierarchy
 from dmil_core.networks import BLOCK, Layer, Network
 from dmil_core.slopes import Slope, slope
 

@@ -11,9 +11,8 @@ import torch
 
 from dmil_core.demonstrations import Demonstration
 from dmil_core.losses import Steps
-from dmil_core.meta_gradient import TaskGradient
-from dmil_core.methods.base import FineTuning, Standardised
-from dmil_core.methods.behaviour_cloning import NetworkPolicy, fine_tuned
+from dmil_core.methods.base import FineTuning, Standardised, TaskGradient
+from dmil_core.methods.behaviour_cloning.method import NetworkPolicy, fine_tuned
 from dmil_core.networks import Network, Parameters, flatten, initialise, mlp, network
 from dmil_core.settings import Count, MethodConfig, Positive, Size
 

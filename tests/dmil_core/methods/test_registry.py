@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from dmil_core.methods.mil_config import MilConfig
-from dmil_core.methods.nearest_neighbour import NearestNeighbourConfig
+from dmil_core.methods.mil.config import MilConfig
+from dmil_core.methods.nearest_neighbour.method import NearestNeighbourConfig
 from dmil_core.methods.registry import OURS, MethodError, config_type, method_names, method_type
 
-NEAREST = "from dmil_core.methods.nearest_neighbour import NearestNeighbour as Nearest"
+NEAREST = "from dmil_core.methods.nearest_neighbour.method import NearestNeighbour as Nearest"
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def test_a_package_s_method_does_not_pass_for_one_of_ours(install, asked: str) -
     with pytest.raises(MethodError) as caught:
         method_type(asked)
     assert str(caught.value) == (
-        "entry points dmil.methods: got mil twice, our own dmil_core.methods.mil:Mil and one_package:Nearest; wanted "
-        "another name than any of ours; rename the package's, or uninstall it"
+        "entry points dmil.methods: got mil twice, our own dmil_core.methods.mil.method:Mil and one_package:Nearest; "
+        "wanted another name than any of ours; rename the package's, or uninstall it"
     )
     assert config_type("mil") is MilConfig

@@ -15,7 +15,7 @@ from ray.cluster_utils import Cluster as Nodes
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import WorkError
-from dmil_core.methods.dmil import Dmil
+from dmil_core.methods.dmil.method import Dmil
 from dmil_core.methods.registry import OURS
 from services import meta_train, reproduce
 from services.cli.arguments import exit_code

@@ -3,7 +3,7 @@ from statistics import stdev
 import pytest
 from scipy.stats import norm, t
 
-from dmil_core.dmil_config import DmilConfig
+from dmil_core.methods.dmil.config import DmilConfig
 from services.evaluation.paper_results import Published
 from services.evaluation.results import AdaptationResult, EpisodeResult
 from services.evaluation.summary import cells, sub_skill_use

@@ -3,7 +3,7 @@ import re
 import numpy as np
 import pytest
 
-from dmil_core.dmil_config import DmilConfig
+from dmil_core.methods.dmil.config import DmilConfig
 from services.demonstrations.store import DemoStore
 from services.evaluation.results import EpisodeResult
 from services.experiments.experiment import Experiment

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from dmil_core.dmil_config import DmilConfig
+from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.statistics import mean_score, success_rate
 from services.evaluation.results import EpisodeResult, write_rows
 from services.evaluation.summary import Summary, cells, write_summary

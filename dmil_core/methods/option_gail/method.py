@@ -1,0 +1,262 @@
+"""OptionGAIL (Jing et al. 2021, "Adversarial option-aware hierarchical imitation learning"), and its half without play.
+
+Both learn one option model of all meta-training tasks together (`options`); there is no meta-learning, and at test a
+few epochs on the support set (F.3). Networks are DMIL's in layers and units, for a fair comparison; the original has
+64x64. With J = Σ_t log π_H(o_t | s_t, o_{t−1}) + log π_L(a_t | s_t, o_t):
+
+- ``option-gail-offline`` goes up the likelihood, log Σ_o exp J, by its exact gradient (forward-backward), so that the
+  options part while none is sure; then it is hard EM: o* = argmax_o J by Viterbi, and up J at o*. It is named as what
+  it is: not adversarial, and without a simulator.
+- ``option-gail`` begins in the same way, and goes on as the original, in the environments of meta-training tasks:
+  1. relabel: o* by Viterbi for the demonstrations;
+  2. discriminate: d(s, a, o', o), one of (K + 1)·K outputs on (s, a), goes down the binary cross-entropy of the
+     policy's steps, which are 1, and the demonstrations', which are 0;
+  3. improve: PPO (Schulman et al. 2017) on the rewards −log σ(d), which both levels share.
+
+What the sources leave open, and what is chosen here:
+
+- *Levels.* As in DAC (Zhang & Whiteson 2019), the two levels are two decision processes on one trajectory: the high
+  one decides in (s_t, o_{t−1}), the low one in (s_t, o_t). A critic gives V_L(s, o); V_H(s, o') = Σ_o π_H(o|s,o') V_L.
+  Each level has advantages of its own (`ppo`, which says why they are not RLlib's), standardised per round.
+- *Ends.* The reward is positive everywhere, so an episode cut off at its success would be worth less than one that
+  never succeeds. Ends come from the protocol and not from the task: every episode is valued by V_H beyond its end.
+- *Centre.* Rewards are taken less their mean over the round. As every episode goes on beyond its end, that changes no
+  true advantage, and it keeps values near 0, where the critic starts.
+- *Weight decay* is decoupled (Loshchilov & Hutter 2019): with moments that start at 0, an L2 term would move a weight
+  of little gradient at the full rate.
+- *Slots.* The original's epoch of 4,096 steps is an iteration here, its steps split over the tasks of its slots. A
+  slot takes its own steps of Adam from where the iteration starts and returns the way, parameters before minus after;
+  the outer step goes to the slots' mean (``outer_step: average``), as in federated averaging (McMahan et al. 2017).
+  Adam's moments start at 0 in each slot. The offline iterations are run in the same way.
+- *Pre-training.* How the appendix's authors pre-trained is not said; the original's 16 million steps are in the size
+  ``paper``, at most half a million of them in ``quick``.
+- *Test.* So many epochs of hard EM on the support set, each one step of Adam on all of it with fresh Viterbi labels.
+  The discriminator and the critic rest: meta-testing tasks are not acted in before they are judged.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dmil_core.demonstrations import Demonstration
+from dmil_core.losses import Steps
+from dmil_core.methods.base import FineTuning, Rollout, Standardised, TaskGradient
+from dmil_core.methods.option_gail.adversary import (
+    POLICY,
+    Played,
+    aims_of,
+    discriminate,
+    discriminator_logits,
+    imitation_rewards,
+    improve,
+    named,
+    orthogonal,
+)
+from dmil_core.methods.option_gail.config import OptionGailConfig, OptionGailOfflineConfig
+from dmil_core.methods.option_gail.option_model import (
+    Chain,
+    OptionModel,
+    pairs_of,
+    posterior,
+    viterbi,
+    weighted_log_likelihood,
+)
+from dmil_core.methods.option_gail.policy import OptionExplorer, OptionPolicy
+from dmil_core.networks import Parameters, flatten, initialise
+
+Phase = Literal["likelihood", "hard", "adversarial"]
+
+
+@dataclass(frozen=True)
+class OptionMaterial:
+    """Whole demonstrations of a task, what is done with them, and what came of acting."""
+
+    demonstrations: tuple[Demonstration, ...]
+    phase: Phase
+    seed: int
+    """Names all that is drawn later."""
+    rollouts: tuple[Rollout, ...] = ()
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """The ids of the demonstrations."""
+        return tuple(demonstration.id for demonstration in self.demonstrations)
+
+
+def _copied(parameters: Parameters) -> dict[str, Tensor]:
+    """Return a copy to descend in place."""
+    return {name: tensor.detach().clone().requires_grad_() for name, tensor in parameters.items()}
+
+
+class _Imitated(NamedTuple):
+    loss: Float[Tensor, ""]
+    """To differentiate: its value is the negative log-likelihood for hard EM only."""
+    metrics: dict[str, float]
+    pairs: Float[Tensor, "steps before options"]
+
+
+class _Options(Standardised[Any]):
+    """What both methods share: one option model, by EM."""
+
+    def initial_parameters(self, stream: np.random.Generator) -> Parameters:
+        """Draw the option model: σ = 1."""
+        hidden = [self.config.hidden_units] * self.config.hidden_layers
+        k, scale = self.config.sub_skills, self.config.output_scale
+        return {
+            **initialise("high", [self.obs_dim, *hidden, (k + 1) * k], stream, output_scale=scale),
+            **initialise("low", [self.obs_dim, *hidden, self.action_dim], stream, copies=k, output_scale=scale),
+            "log_deviations": torch.zeros(k, self.action_dim),
+        }
+
+    def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> OptionPolicy:
+        """Take steps of Adam up the complete-data log-likelihood of the support set, relabelled before each."""
+        policy = {name: tensor for name, tensor in parameters.items() if name.startswith(POLICY)}
+        adapted = _copied(policy)
+        descent = torch.optim.Adam(adapted.values(), lr=fine_tuning.learning_rate, fused=True)
+        steps = Steps.of(support, self.standardise)
+        for _ in range(fine_tuning.steps):
+            _step(descent, self._imitate(adapted, steps, "hard").loss)
+        return OptionPolicy(self._model({name: tensor.detach() for name, tensor in adapted.items()}), self.standardise)
+
+    def _model(self, parameters: Parameters) -> OptionModel:
+        return OptionModel.of(parameters, self.config.least_log_deviation)
+
+    def _draw(
+        self, demonstrations: Sequence[Demonstration], phase: Phase, stream: np.random.Generator
+    ) -> OptionMaterial:
+        """Draw a slot's demonstrations, each at most once."""
+        count = min(self.config.trajectories, len(demonstrations))
+        chosen = stream.choice(len(demonstrations), count, replace=False)
+        return OptionMaterial(tuple(demonstrations[index] for index in chosen), phase, int(stream.integers(2**63)))
+
+    def _imitate(self, parameters: Parameters, steps: Steps, phase: Phase) -> _Imitated:
+        """Return what EM goes down, per step: the E-step's weights are held fixed."""
+        model, count = self._model(parameters), len(steps.states)
+        log_high, log_low = model.log_high(steps.states), model.log_low(steps.states, steps.actions)
+        chain = Chain.of(log_high.detach(), log_low.detach(), steps.lengths)
+        if phase == "likelihood":
+            log_likelihoods, pairs = posterior(chain)
+            value = -log_likelihoods.sum().item() / count
+        else:
+            pairs, value = pairs_of(viterbi(chain), steps.lengths, model.options), None
+        loss = -weighted_log_likelihood(log_high, log_low, pairs) / count
+        within = pairs[:, : model.options]
+        metrics = {
+            "loss": loss.item() if value is None else value,
+            "switches": 1 - (within.diagonal(dim1=1, dim2=2).sum() / within.sum().clamp(min=1)).item(),
+            "deviation": model.log_deviations.detach().exp().mean().item(),
+            **{f"sub_skill_share/{k}": share for k, share in enumerate(pairs.mean(0).sum(0).tolist())},
+        }
+        return _Imitated(loss, metrics, pairs)
+
+
+def _step(descent: torch.optim.Optimizer, loss: Float[Tensor, ""]) -> None:
+    """Take one step down a loss."""
+    descent.zero_grad()
+    loss.backward()
+    descent.step()
+
+
+class OptionGailOffline(_Options):
+    """Maximum likelihood, then hard EM, for observations and actions of given sizes."""
+
+    config_type = OptionGailOfflineConfig
+
+    def sample(
+        self, demonstrations: Sequence[Demonstration], iteration: int, stream: np.random.Generator
+    ) -> OptionMaterial:
+        """Draw whole demonstrations."""
+        phase = "likelihood" if iteration < self.config.likelihood_iterations else "hard"
+        return self._draw(demonstrations, phase, stream)
+
+    def task_gradient(self, parameters: Parameters, material: OptionMaterial) -> TaskGradient:
+        """Return the gradient of −log p per step: of the actions, or of the actions and Viterbi's labels."""
+        leaves = {name: tensor.detach().requires_grad_() for name, tensor in parameters.items()}
+        imitated = self._imitate(leaves, Steps.of(material.demonstrations, self.standardise), material.phase)
+        gradients = torch.autograd.grad(imitated.loss, list(leaves.values()))
+        return TaskGradient(flatten(dict(zip(leaves, gradients, strict=True))), imitated.metrics)
+
+
+class OptionGail(_Options):
+    """OptionGAIL for observations and actions of given sizes."""
+
+    config_type = OptionGailConfig
+
+    def initial_parameters(self, stream: np.random.Generator) -> Parameters:
+        """Draw the option model, the critic V_L(s, o) and the discriminator."""
+        k, critic, judge = self.config.sub_skills, self.config.critic_units, self.config.discriminator_units
+        return {
+            **super().initial_parameters(stream),
+            **orthogonal("critic", [self.obs_dim, critic, critic, k], stream),
+            **orthogonal("discriminator", [self.obs_dim + self.action_dim, judge, judge, (k + 1) * k], stream),
+        }
+
+    def practice_steps(self, iteration: int) -> int:
+        """Return none before the adversarial iterations."""
+        return 0 if iteration < self.config.offline_iterations else self.config.environment_steps
+
+    def sample(
+        self, demonstrations: Sequence[Demonstration], iteration: int, stream: np.random.Generator
+    ) -> OptionMaterial:
+        """Draw whole demonstrations."""
+        if iteration >= self.config.offline_iterations:
+            return self._draw(demonstrations, "adversarial", stream)
+        phase = "likelihood" if iteration < self.config.likelihood_iterations else "hard"
+        return self._draw(demonstrations, phase, stream)
+
+    def explorer(self, parameters: Parameters, material: OptionMaterial) -> OptionExplorer:
+        """Return the option model, which acts at random."""
+        model = self._model({name: tensor.detach() for name, tensor in parameters.items()})
+        return OptionExplorer(model, self.standardise, material.seed)
+
+    def with_practice(self, material: OptionMaterial, rollouts: Sequence[Rollout]) -> OptionMaterial:
+        """Keep the rollouts that have a step."""
+        return replace(material, rollouts=tuple(rollout for rollout in rollouts if len(rollout.actions)))
+
+    def task_gradient(self, parameters: Parameters, material: OptionMaterial) -> TaskGradient:
+        """Return the way that the slot's own steps of Adam went, before minus after."""
+        moved = _copied(parameters)
+        demonstrated = Steps.of(material.demonstrations, self.standardise)
+        if material.phase == "adversarial":
+            metrics = self._play_round(moved, demonstrated, material)
+        else:
+            metrics = self._imitate_for_some_steps(moved, demonstrated, material.phase)
+        with torch.no_grad():
+            return TaskGradient(flatten({name: parameters[name] - moved[name] for name in moved}), metrics)
+
+    def _imitate_for_some_steps(self, moved: dict[str, Tensor], demonstrated: Steps, phase: Phase) -> dict[str, float]:
+        """Descend in place, and return the metrics before."""
+        descent = torch.optim.Adam(named(moved, POLICY), lr=self.config.offline_learning_rate, fused=True)
+        metrics = []
+        for _ in range(self.config.offline_steps):
+            imitated = self._imitate(moved, demonstrated, phase)
+            metrics.append(imitated.metrics)
+            _step(descent, imitated.loss)
+        return metrics[0]
+
+    def _play_round(self, moved: dict[str, Tensor], demonstrated: Steps, material: OptionMaterial) -> dict[str, float]:
+        """Relabel, discriminate and improve in place, and return the metrics."""
+        generator, rollouts = torch.Generator().manual_seed(material.seed), material.rollouts
+        with torch.no_grad():
+            labelled = self._imitate(moved, demonstrated, "hard")
+        start = self.config.sub_skills
+        expert = Played.of(demonstrated, labelled.pairs.sum(1).argmax(-1), start)
+        played = Played.of_rollouts(rollouts, self.standardise, start)
+        judged = discriminate(moved, played, expert, self.config, generator)
+        with torch.no_grad():
+            rewards = imitation_rewards(discriminator_logits(moved, played, start))
+        last = np.stack([rollout.observations[-1] for rollout in rollouts])
+        aims = aims_of(moved, played, rewards, torch.from_numpy(self.standardise(last)), self.config)
+        return {
+            **labelled.metrics,
+            **judged,
+            "reward": rewards.mean().item(),
+            **improve(moved, played, aims, self.config, generator),
+            "environment_steps": float(len(played.options)),
+            "practice_success": float(np.mean([rollout.success for rollout in rollouts])),
+        }

@@ -1,0 +1,159 @@
+"""OptionGAIL's discriminator, the advantages of both levels, and PPO: one by one, and on a known reward."""
+
+import numpy as np
+import pytest
+import torch
+
+from dmil_core.losses import Steps
+from dmil_core.methods.option_gail.adversary import (
+    Aims,
+    Played,
+    aims_of,
+    decisions,
+    discriminate,
+    discriminator_logits,
+    discriminator_loss,
+    high_values,
+    imitation_rewards,
+    improve,
+    low_values,
+    orthogonal,
+)
+from dmil_core.methods.option_gail.method import OptionGail
+from dmil_core.methods.option_gail.option_model import options_before
+from dmil_core.seeding import stream
+from tests.dmil_core.methods.conftest import PLAYING, drawn_parameters, model_of
+from tests.dmil_core.methods.toys import STEPS, practise, record
+
+
+@pytest.fixture
+def played(playing, rollouts) -> Played:
+    return Played.of_rollouts(rollouts, playing.standardise, 3)
+
+
+def test_orthogonal_weights_keep_lengths() -> None:
+    drawn = orthogonal("critic", [4, 8, 8, 3], np.random.default_rng(0))
+    first, second, last = (drawn[f"critic.{layer}.weight"] for layer in range(3))
+    torch.testing.assert_close(first.T @ first, 2 * torch.eye(4))
+    torch.testing.assert_close(second.T @ second, 2 * torch.eye(8))
+    torch.testing.assert_close(last @ last.T, torch.eye(3))
+
+
+def test_loss_and_reward_are_those_of_the_sigmoid() -> None:
+    of_policy, of_expert = torch.tensor([2.0, -1.0]), torch.tensor([0.5])
+    expected = -of_policy.sigmoid().log().mean() - (1 - of_expert.sigmoid()).log().mean()
+    torch.testing.assert_close(discriminator_loss(of_policy, of_expert), expected)
+    torch.testing.assert_close(imitation_rewards(of_policy), -of_policy.sigmoid().log())
+    assert imitation_rewards(torch.tensor([200.0, 0.0])).tolist() == pytest.approx([0.0, np.log(2)])
+
+
+def test_rollouts_lie_one_after_the_other(playing, played, rollouts) -> None:
+    assert played.steps.lengths.tolist() == [5, 1, 3]
+    assert [played.before[t].item() for t in (0, 5, 6)] == [3, 3, 3]
+    assert torch.equal(played.before, options_before(played.options, played.steps.lengths, 3))
+    np.testing.assert_allclose(played.steps.states[6:], playing.standardise(rollouts[2].observations[:3]))
+    np.testing.assert_allclose(played.steps.actions[6:], rollouts[2].actions)
+    some = played.at(torch.tensor([6, 1]))
+    assert some.before.tolist() == [3, played.options[0].item()]
+    assert torch.equal(some.steps.actions, played.steps.actions[[6, 1]])
+
+
+def test_logits_are_indexed_by_the_option_before_and_at(playing, played, plain_mlp) -> None:
+    parameters = drawn_parameters(playing)
+    judge = tuple((parameters[f"discriminator.{n}.weight"], parameters[f"discriminator.{n}.bias"]) for n in range(3))
+    found = discriminator_logits(parameters, played, 3)
+    for t, logit in enumerate(found):
+        outputs = plain_mlp(judge, torch.cat([played.steps.states[t], played.steps.actions[t]])).view(4, 3)
+        torch.testing.assert_close(logit, outputs[played.before[t], played.options[t]])
+
+
+def test_the_discriminator_learns_to_tell_them_apart(playing, played, demonstrations) -> None:
+    steps = Steps.of(demonstrations, playing.standardise)
+    expert = Played.of(steps._replace(actions=steps.actions + 3), torch.zeros(len(steps.states), dtype=torch.int64), 3)
+    config = PLAYING.model_copy(update={"discriminator_passes": 100, "learning_rate": 1e-2})
+    moved = {name: tensor.clone().requires_grad_() for name, tensor in drawn_parameters(playing).items()}
+    before = {name: tensor.detach().clone() for name, tensor in moved.items()}
+    metrics = discriminate(moved, played, expert, config, torch.Generator().manual_seed(0))
+    assert metrics["discriminator_accuracy"] == 1
+    with torch.no_grad():
+        of_policy, of_expert = (discriminator_logits(moved, side, 3) for side in (played, expert))
+    assert imitation_rewards(of_expert).min() > imitation_rewards(of_policy).max()
+    for name, tensor in moved.items():
+        assert torch.equal(tensor, before[name]) == (not name.startswith("discriminator"))
+
+
+def test_aims_follow_from_the_values_of_both_levels(playing, played, rollouts) -> None:
+    parameters, discount, both = drawn_parameters(playing), PLAYING.discount, PLAYING.discount * PLAYING.smoothing
+    rewards = torch.rand(9, generator=torch.Generator().manual_seed(0))
+    beyond = torch.from_numpy(playing.standardise(np.stack([one.observations[-1] for one in rollouts])))
+    found = aims_of(parameters, played, rewards, beyond, PLAYING)
+
+    with torch.no_grad():
+        low = low_values(parameters, played)
+        high = high_values(parameters, played.steps.states, played.before, PLAYING)
+        chances = model_of(parameters).log_high(played.steps.states).exp()
+        for t in range(9):
+            of_each = [
+                low_values(parameters, played.at(torch.tensor([t]))._replace(options=torch.tensor([option])))
+                for option in range(3)
+            ]
+            torch.testing.assert_close(high[t], (chances[t, played.before[t]] * torch.cat(of_each)).sum())
+        last = high_values(parameters, beyond, played.options[[4, 5, 8]], PLAYING)
+
+    def advantages(values: torch.Tensor) -> torch.Tensor:
+        each = []
+        for first, end, after in ((0, 5, last[0]), (5, 6, last[1]), (6, 9, last[2])):
+            later = torch.cat([values[first + 1 : end], after[None]])
+            errors = (rewards - rewards.mean())[first:end] + discount * later - values[first:end]
+            each += [sum(both**n * error for n, error in enumerate(errors[t:])) for t in range(end - first)]
+        return torch.stack(each)
+
+    for of_level, values in ((found.high, high), (found.low, low)):
+        expected = advantages(values)
+        expected = (expected - expected.mean()) / expected.std(correction=0)
+        torch.testing.assert_close(of_level, expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(found.returns, advantages(low) + low, rtol=1e-4, atol=1e-5)
+
+
+def test_improvement_follows_the_advantages_of_each_level(playing, played) -> None:
+    liked = (played.options == 1).float() * 2 - 1
+    high_up = played.steps.actions[:, 0].sign()
+    aims = Aims(liked, high_up, torch.full((9,), 0.5))
+    config = PLAYING.model_copy(update={"policy_epochs": 30, "learning_rate": 1e-3})
+    moved = {name: tensor.clone().requires_grad_() for name, tensor in drawn_parameters(playing).items()}
+    before = {name: tensor.detach().clone() for name, tensor in moved.items()}
+    metrics = improve(moved, played, aims, config, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        old, new = (decisions(parameters, played, config) for parameters in (before, moved))
+        errors = [low_values(parameters, played) - 0.5 for parameters in (before, moved)]
+    assert ((new.high - old.high) * liked).mean() > 0
+    assert ((new.low - old.low) * high_up).mean() > 0
+    assert errors[1].square().mean() < errors[0].square().mean()
+    assert metrics["value_error"] == pytest.approx(errors[1].square().mean().item())
+    for name, tensor in moved.items():
+        assert torch.equal(tensor, before[name]) == name.startswith("discriminator")
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_practice_improves_a_known_reward() -> None:
+    """The explorer, the advantages and PPO, with a reward in place of the discriminator's: where to go, and how."""
+    demonstrations = record(0, 2).demonstrations
+    config = PLAYING.model_copy(
+        update={"sub_skills": 2, "hidden_layers": 1, "hidden_units": 16, "output_scale": 0.1}
+        | {"learning_rate": 3e-3, "minibatch": 64, "policy_epochs": 4, "discount": 0.9}
+    )
+    method = OptionGail.prepared(config, 2, demonstrations)
+    moved = {name: tensor.requires_grad_() for name, tensor in method.initial_parameters(stream(0, "initial")).items()}
+    means = []
+    for iteration in range(25):
+        material = method.sample(demonstrations, config.offline_iterations, stream(0, "batch", iteration))
+        rollouts = practise(method.explorer(moved, material), "task-0", iteration, 5 * STEPS)
+        played = Played.of_rollouts(rollouts, method.standardise, 2)
+        rewards = -(played.steps.actions - torch.tensor([-1.0, 0.5])).square().sum(1) + 2.0 * (played.options == 1)
+        last = torch.from_numpy(method.standardise(np.stack([one.observations[-1] for one in rollouts])))
+        aims = aims_of(moved, played, rewards, last, config)
+        improve(moved, played, aims, config, torch.Generator().manual_seed(iteration))
+        means.append(rewards.mean().item())
+    # At first −(1² + 0.5² + 2σ²) + 1 = −2.25; at best 2, less 2σ².
+    assert means[0] == pytest.approx(-2.25, abs=0.5)
+    assert means[-1] > 0.5
