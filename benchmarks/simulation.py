@@ -39,8 +39,8 @@ from dmil_core.seeding import stream
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.distributed.simulation_worker import SimulationWorker
+from services.rollouts.adaptations import AdaptationOutcome, plan_adaptations
 from services.rollouts.episodes import demonstrate
-from services.rollouts.trials import TrialOutcome, trials
 from services.suites.metaworld import SPLITS, MetaWorldSuite, SeededEpisodes
 
 mujoco: Any = compiled_mujoco  # compiled, so a type checker sees nothing of it
@@ -48,7 +48,7 @@ mujoco: Any = compiled_mujoco  # compiled, so a type checker sees nothing of it
 STEPS_TARGET, PHYSICS_TARGET, EVALUATION_TARGET = 1.8, 0.6, 2.5
 """Ours over stock steps/s; ours over bare physics; Meta-World's seconds of an evaluation over ours."""
 DRAWS = 4
-"""Trials that a task's episodes are spread over, as in this project's evaluations."""
+"""Adaptations that a task's episodes are spread over, as in this project's evaluations."""
 EXPERT_STEPS = 300
 """In an expert's episode at most."""
 TRAILING_STEPS = 10
@@ -291,8 +291,8 @@ def start_worker(suite: MetaWorldSuite) -> None:
     worker = SimulationWorker(suite)
 
 
-def try_out(call: tuple[Any, ...]) -> TrialOutcome:
-    """Let this process's simulation worker adapt and roll out one trial."""
+def try_out(call: tuple[Any, ...]) -> AdaptationOutcome:
+    """Let this process's simulation worker adapt once and roll out."""
     return worker.try_out(*call)
 
 
@@ -304,11 +304,11 @@ def evaluation_row(given: Arguments) -> dict[str, Any]:
     method, parameters, demonstrations = one_policy(suite, tasks, given.fine_tuning_steps)
     policy = method.adapt(parameters, demonstrations[tasks[0]], FineTuning(0, 0.0))
     settings = EvaluationConfig(shots=(1,), episodes=episodes, support_draws=DRAWS, fine_tuning_steps=0)
-    plan = trials([("meta-testing", task) for task in tasks], settings)
+    plan = plan_adaptations([("meta-testing", task) for task in tasks], settings)
     shapes = {name: tensor.shape for name, tensor in parameters.items()}
     flat = flatten(parameters).numpy()
     agents: list[StockAgent] = []
-    outcomes: list[TrialOutcome] = []
+    outcomes: list[AdaptationOutcome] = []
     envs: Any = gymnasium.make_vec(
         "Meta-World/custom-mt-envs",
         vector_strategy="async",
@@ -325,7 +325,9 @@ def evaluation_row(given: Arguments) -> dict[str, Any]:
     with ProcessPoolExecutor(cores, get_context("spawn"), start_worker, (suite,)) as pool:
 
         def ours() -> None:
-            calls = [(method, flat, shapes, trial, demonstrations[trial.task], settings, 0) for trial in plan]
+            calls = [
+                (method, flat, shapes, adaptation, demonstrations[adaptation.task], settings, 0) for adaptation in plan
+            ]
             outcomes[:] = pool.map(try_out, calls)
 
         both = {"stock": stock, "ours": ours}

@@ -36,7 +36,7 @@ def run(arguments: Sequence[str]) -> None:
     failure = read_failure(given.failure)
     console.print(f"{failure.where}: it failed with\n{failure.problem}\nand is done again:")
     experiment = Experiment(failure.config, open_store())
-    work = _attempt if "attempt" in failure.piece else _slot if "slot" in failure.piece else _trial
+    work = _attempt if "attempt" in failure.piece else _slot if "slot" in failure.piece else _adaptation
     work(failure, experiment)()
     console.print("it comes to its end here: look for what differs, such as memory, versions or the machine")
 
@@ -60,13 +60,13 @@ def _slot(failure: Failure, experiment: Experiment) -> Callable[[], object]:
     return lambda: group_gradient(method, sets, parameters, config.seed, iteration, tasks, [slot], worker.practise)
 
 
-def _trial(failure: Failure, experiment: Experiment) -> Callable[[], object]:
+def _adaptation(failure: Failure, experiment: Experiment) -> Callable[[], object]:
     runner = LocalRunner(experiment.suite)
     evaluator = experiment.evaluator(runner, experiment.collect(runner))
     (call,) = (
         call
-        for trial, call in zip(evaluator.trials, evaluator.calls(_checkpoint(failure)), strict=True)
-        if trial.piece == failure.piece
+        for adaptation, call in zip(evaluator.adaptations, evaluator.calls(_checkpoint(failure)), strict=True)
+        if adaptation.piece == failure.piece
     )
     return lambda: list(runner.simulate("try_out", [call]))
 

@@ -13,8 +13,8 @@ from dmil_core.errors import as_work_error
 from dmil_core.methods.base import Method, Policy, Rollout
 from dmil_core.networks import unflatten
 from dmil_core.seeding import stream_seed
+from services.rollouts.adaptations import Adaptation, AdaptationOutcome, Imitation, imitate, try_out
 from services.rollouts.episodes import demonstrate, episodes_beside, practise
-from services.rollouts.trials import Imitation, Trial, TrialOutcome, imitate, try_out
 from services.rollouts.verification import VerificationRow, verify
 from services.suites.base import Attempt, Environment, TaskSuite, build_env
 
@@ -75,38 +75,38 @@ class SimulationWorker:
         method: Method,
         parameters: Float32[np.ndarray, " size"],
         shapes: Mapping[str, torch.Size],
-        trial: Trial,
+        adaptation: Adaptation,
         held_out: Sequence[Demonstration],
         evaluation: EvaluationConfig,
         seed: int,
-    ) -> TrialOutcome:
-        """Adapt and roll out one trial.
+    ) -> AdaptationOutcome:
+        """Adapt and roll out one adaptation.
 
         Raises:
             WorkError: for a Python error in it.
         """
-        with as_work_error(f"{trial.in_words}, seed {seed}", **trial.piece):
-            envs = self._environments(trial.task, len(trial.episodes))
+        with as_work_error(f"{adaptation.in_words}, seed {seed}", **adaptation.piece):
+            envs = self._environments(adaptation.task, len(adaptation.episodes))
             own = unflatten(torch.tensor(parameters), shapes)
-            return try_out(method, own, trial, held_out, envs, self._suite.horizon, evaluation, seed)
+            return try_out(method, own, adaptation, held_out, envs, self._suite.horizon, evaluation, seed)
 
     def imitate(
         self,
         method: Method,
         parameters: Float32[np.ndarray, " size"],
         shapes: Mapping[str, torch.Size],
-        trial: Trial,
+        adaptation: Adaptation,
         held_out: Sequence[Demonstration],
         evaluation: EvaluationConfig,
         seed: int,
     ) -> Imitation:
-        """Adapt as in one trial, and compare the policy with demonstrations; the arguments are those of `try_out`.
+        """Adapt as in one adaptation, and compare the policy with demonstrations; the arguments are those of `try_out`.
 
         Raises:
             WorkError: for a Python error in it.
         """
-        with as_work_error(f"{trial.in_words}, seed {seed}", **trial.piece):
-            return imitate(method, unflatten(torch.tensor(parameters), shapes), trial, held_out, evaluation)
+        with as_work_error(f"{adaptation.in_words}, seed {seed}", **adaptation.piece):
+            return imitate(method, unflatten(torch.tensor(parameters), shapes), adaptation, held_out, evaluation)
 
 
 def piece_of_call(method: str, arguments: Sequence[Any]) -> tuple[str, dict[str, str | int]]:
@@ -117,5 +117,5 @@ def piece_of_call(method: str, arguments: Sequence[Any]) -> tuple[str, dict[str,
     if method == "verify":
         task, seeds, _ = arguments
         return f"task {task}, seeds {seeds[0]} to {seeds[-1]}", {"task": task, "seed": seeds[0]}
-    trial: Trial = arguments[3]
-    return trial.in_words, trial.piece
+    adaptation: Adaptation = arguments[3]
+    return adaptation.in_words, adaptation.piece

@@ -21,7 +21,7 @@ from services.distributed.metrics import EPISODES, SUCCESS_RATE, SUCCESSES, Mete
 from services.distributed.runner import Runner, Simulation
 from services.evaluation.results import AdaptationResult, EpisodeResult, ImitationResult, write_rows
 from services.evaluation.summary import Evaluation, cells, rates, sub_skill_use
-from services.rollouts.trials import Imitation, Trial, TrialOutcome, trials
+from services.rollouts.adaptations import Adaptation, AdaptationOutcome, Imitation, plan_adaptations
 from services.storage.checkpoints import Checkpoint, Checkpoints
 from services.storage.provenance import library_versions
 from services.suites.base import Split, TaskSuite
@@ -43,13 +43,13 @@ class Tallies:
         found = [Tally(*where, *counts) for where, counts in list(self._counts.items())]
         return iter(sorted(found, key=lambda tally: (tally.split == "meta-testing", tally.shots)))
 
-    def add(self, trial: Trial, outcome: TrialOutcome) -> None:
-        """Count a trial's episodes."""
+    def add(self, adaptation: Adaptation, outcome: AdaptationOutcome) -> None:
+        """Count an adaptation's episodes."""
         successes, episodes = sum(episode.success for episode in outcome.episodes), len(outcome.episodes)
-        before = self._counts.get((trial.split, trial.shots), (0, 0))
-        self._counts[trial.split, trial.shots] = before[0] + successes, before[1] + episodes
-        self._meter.record(EPISODES, float(episodes), split=trial.split, shots=str(trial.shots))
-        self._meter.record(SUCCESSES, float(successes), split=trial.split, shots=str(trial.shots))
+        before = self._counts.get((adaptation.split, adaptation.shots), (0, 0))
+        self._counts[adaptation.split, adaptation.shots] = before[0] + successes, before[1] + episodes
+        self._meter.record(EPISODES, float(episodes), split=adaptation.split, shots=str(adaptation.shots))
+        self._meter.record(SUCCESSES, float(successes), split=adaptation.split, shots=str(adaptation.shots))
 
     def finish(self) -> None:
         """Tell the success rates, now that all episodes are counted."""
@@ -81,7 +81,7 @@ class Evaluator:
             held_out: of each task, those that support sets are drawn from.
         """
         self._runner, self.config, self._suite, self._data, self._held_out = runner, config, suite, data, held_out
-        self.trials = trials(tasks, config.evaluation)
+        self.adaptations = plan_adaptations(tasks, config.evaluation)
         self._shared = {task: runner.share(demonstrations) for task, demonstrations in held_out.items()}
 
     def is_due(self, iteration: int) -> bool:
@@ -90,7 +90,7 @@ class Evaluator:
         return every is not None and 0 < iteration < self.config.training.iterations and iteration % every == 0
 
     def calls(self, checkpoint: Checkpoint) -> list[tuple[Any, ...]]:
-        """Return the arguments of `SimulationWorker.try_out`, and of its `imitate`, for each trial.
+        """Return the arguments of `SimulationWorker.try_out`, and of its `imitate`, for each adaptation.
 
         The checkpoint is not read again.
         """
@@ -99,16 +99,16 @@ class Evaluator:
         parameters = self._runner.share(checkpoint.state.parameters)
         config = self.config
         return [
-            (method, parameters, shapes, trial, self._shared[trial.task], config.evaluation, config.seed)
-            for trial in self.trials
+            (method, parameters, shapes, adaptation, self._shared[adaptation.task], config.evaluation, config.seed)
+            for adaptation in self.adaptations
         ]
 
-    def evaluation(self, checkpoint: Checkpoint, outcomes: Iterable[TrialOutcome]) -> Evaluation:
-        """Return a row for each episode and each adaptation, from the outcomes of the trials in their order."""
+    def evaluation(self, checkpoint: Checkpoint, outcomes: Iterable[AdaptationOutcome]) -> Evaluation:
+        """Return a row for each episode and each adaptation, from the outcomes of the adaptations in their order."""
         episodes, adaptations = [], []
-        for trial, outcome in zip(self.trials, outcomes, strict=True):
-            row = self._row(checkpoint, trial)
-            episodes += _episode_rows(row, trial, outcome)
+        for adaptation, outcome in zip(self.adaptations, outcomes, strict=True):
+            row = self._row(checkpoint, adaptation)
+            episodes += _episode_rows(row, adaptation, outcome)
             adaptations.append(_adaptation_row(row, outcome, sub_skills_of(self.config.method)))
         failed = {task: dataset.failed for task, dataset in self._data.items()}
         held = {task: len(dataset.demonstrations) for task, dataset in self._data.items()}
@@ -116,20 +116,20 @@ class Evaluator:
         return Evaluation(checkpoint, suite.protocol, suite.best_score, failed, held, episodes, adaptations)
 
     def imitation(self, checkpoint: Checkpoint, outcomes: Iterable[Imitation]) -> list[ImitationResult]:
-        """Return a row for each trial, from what `SimulationWorker.imitate` found in them in their order."""
+        """Return a row for each adaptation, from what `SimulationWorker.imitate` found in them in their order."""
         return [
             ImitationResult.model_validate(
                 {
-                    **self._row(checkpoint, trial),
+                    **self._row(checkpoint, adaptation),
                     "support_error": _finite(outcome.support),
                     "held_out_error": _finite(outcome.held_out),
                 }
             )
-            for trial, outcome in zip(self.trials, outcomes, strict=True)
+            for adaptation, outcome in zip(self.adaptations, outcomes, strict=True)
         ]
 
-    def _row(self, checkpoint: Checkpoint, trial: Trial) -> dict[str, object]:
-        """Return what names a trial in all of its rows."""
+    def _row(self, checkpoint: Checkpoint, adaptation: Adaptation) -> dict[str, object]:
+        """Return what names an adaptation in all of its rows."""
         settings = self.config.evaluation
         return {
             "suite": self._suite.name,
@@ -139,12 +139,12 @@ class Evaluator:
             "versions": library_versions(),
             "fine_tuning_steps": settings.fine_tuning_steps,
             "learning_rate": settings.learning_rate,
-            "split": trial.split,
-            "task": trial.task,
-            "shots": trial.shots,
-            "draw": trial.draw,
-            "support": [demonstration.id for demonstration in trial.support(self._held_out[trial.task])],
-            "data": self._data[trial.task].digest,
+            "split": adaptation.split,
+            "task": adaptation.task,
+            "shots": adaptation.shots,
+            "draw": adaptation.draw,
+            "support": [demonstration.id for demonstration in adaptation.support(self._held_out[adaptation.task])],
+            "data": self._data[adaptation.task].digest,
         }
 
     def _method(self, checkpoint: Checkpoint) -> Standardised[Any]:
@@ -220,13 +220,13 @@ class Evaluations:
                 self._record(checkpoint, simulation.results())
             self._under_way = None
 
-    def _record(self, checkpoint: Checkpoint, outcomes: Sequence[TrialOutcome]) -> None:
+    def _record(self, checkpoint: Checkpoint, outcomes: Sequence[AdaptationOutcome]) -> None:
         iteration = checkpoint.manifest.iteration
         evaluation = self._evaluator.evaluation(checkpoint, outcomes)
         write_evaluation(evaluation, self._folder / f"{iteration:07d}")
         tallies = Tallies(self._runner.meter)
-        for trial, outcome in zip(self._evaluator.trials, outcomes, strict=True):
-            tallies.add(trial, outcome)
+        for adaptation, outcome in zip(self._evaluator.adaptations, outcomes, strict=True):
+            tallies.add(adaptation, outcome)
         tallies.finish()
         self.found = {"success": list(tallies), "after": iteration}
         found = cells(evaluation.episodes, evaluation.best_score, self._evaluator.config.method)
@@ -249,14 +249,14 @@ def _finite(error: float | None) -> float | None:
     return error if error is not None and np.isfinite(error) else None
 
 
-def _episode_rows(row: Mapping[str, object], trial: Trial, outcome: TrialOutcome) -> list[EpisodeResult]:
+def _episode_rows(row: Mapping[str, object], adaptation: Adaptation, outcome: AdaptationOutcome) -> list[EpisodeResult]:
     return [
         EpisodeResult.model_validate({**row, "episode": number, **episode.outcome})
-        for number, episode in zip(trial.episodes, outcome.episodes, strict=True)
+        for number, episode in zip(adaptation.episodes, outcome.episodes, strict=True)
     ]
 
 
-def _adaptation_row(row: Mapping[str, object], outcome: TrialOutcome, sub_skills: int) -> AdaptationResult:
+def _adaptation_row(row: Mapping[str, object], outcome: AdaptationOutcome, sub_skills: int) -> AdaptationResult:
     none = np.zeros(0, np.int64)  # where the support set is all that is held out
     chosen = np.concatenate([none, *(use.chosen for use in outcome.use)])
     best = np.concatenate([none, *(use.best for use in outcome.use)])

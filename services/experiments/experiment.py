@@ -30,7 +30,7 @@ from services.distributed.runner import LocalRunner, Plan, Runner
 from services.evaluation.evaluator import Evaluations, Evaluator, Tallies, write_evaluation
 from services.evaluation.summary import AGAINST_COLLAPSE, COLLAPSED, Evaluation
 from services.experiments.iteration_metrics import figures_of, iteration_metrics, nonfinite_in_words, shares_of
-from services.rollouts.trials import TrialOutcome
+from services.rollouts.adaptations import AdaptationOutcome
 from services.storage.checkpoints import Checkpoint, CheckpointError, Checkpoints, Manifest
 from services.storage.provenance import library_versions
 from services.suites.base import Split, TaskSuite
@@ -317,24 +317,24 @@ class Experiment:
             only: of all tasks, those to adapt to.
         """
         evaluator = self.evaluator(runner, data, only)
-        outcomes: dict[int, TrialOutcome] = {}
+        outcomes: dict[int, AdaptationOutcome] = {}
         tallies, at = Tallies(runner.meter), ""
 
         def figures() -> Figures:
             return Figures(success=list(tallies), workers=runner.staff, at=at)
 
         with (
-            Bar("evaluating", sum(len(trial.episodes) for trial in evaluator.trials), 0, "episodes", figures) as bar,
+            Bar("evaluating", sum(len(each.episodes) for each in evaluator.adaptations), 0, "episodes", figures) as bar,
             keeping_failures(folder, self.config, lambda: checkpoint.path),
         ):
             for index, outcome in runner.simulate("try_out", evaluator.calls(checkpoint)):
                 outcomes[index] = outcome
-                trial = evaluator.trials[index]
-                tallies.add(trial, outcome)
-                at = trial.task
-                bar.advance(len(trial.episodes))
+                adaptation = evaluator.adaptations[index]
+                tallies.add(adaptation, outcome)
+                at = adaptation.task
+                bar.advance(len(adaptation.episodes))
         tallies.finish()
-        evaluation = evaluator.evaluation(checkpoint, [outcomes[index] for index in range(len(evaluator.trials))])
+        evaluation = evaluator.evaluation(checkpoint, [outcomes[index] for index in range(len(evaluator.adaptations))])
         write_evaluation(evaluation, folder)
         return evaluation
 

@@ -55,11 +55,11 @@ class Replay:
     run: FinishedRun
     _envs: dict[str, list[Environment]] = field(default_factory=dict)
 
-    def trial(self, row: EpisodeResult, film: Film | None = None, filmed: Sequence[int] = ()) -> list[Seen]:
-        """Adapt as for the episode of `row`, and run all episodes of that trial, side by side as they were.
+    def rerun(self, row: EpisodeResult, film: Film | None = None, filmed: Sequence[int] = ()) -> list[Seen]:
+        """Adapt as for the episode of `row`, and run all episodes of that adaptation, side by side as they were.
 
         Args:
-            row: of any episode of the trial.
+            row: of any episode of the adaptation.
             film: how episodes are filmed.
             filmed: the numbers of those that are.
 
@@ -67,7 +67,7 @@ class Replay:
             ReplayError: if the checkpoint or the demonstrations are not those of the row.
             RenderingError: if there is nothing here to draw with.
         """
-        rows = [other for other in self.run.episodes if _trial(other) == _trial(row)]
+        rows = [other for other in self.run.episodes if _adaptation(other) == _adaptation(row)]
         policy = self._policy(row)
         films: Mapping[int, Film] = {
             place: film for place, other in enumerate(rows) if film is not None and other.episode in filmed
@@ -141,7 +141,7 @@ class Replay:
         self._envs.clear()
 
 
-def _trial(row: EpisodeResult) -> tuple[object, ...]:
+def _adaptation(row: EpisodeResult) -> tuple[object, ...]:
     return row.split, row.task, row.shots, row.draw
 
 

@@ -164,11 +164,12 @@ def _rows(folder: Path) -> tuple[list[EpisodeResult], list[ImitationResult]]:
 def _is_measured(folder: Path, evaluator: Evaluator, plan: CurvePlan, steps: int) -> bool:
     """Tell whether a folder has all rows of an evaluation, and no others."""
     episodes, errors = _rows(folder)
-    trials = [(trial.task, trial.shots, trial.draw) for trial in evaluator.trials]
+    adaptations = [(adaptation.task, adaptation.shots, adaptation.draw) for adaptation in evaluator.adaptations]
     settings = {(row.checkpoint, row.fine_tuning_steps, row.learning_rate) for row in (*episodes, *errors)}
     return (
-        [(row.task, row.shots, row.draw) for row in errors] == trials
-        and [row.episode for row in episodes] == [number for trial in evaluator.trials for number in trial.episodes]
+        [(row.task, row.shots, row.draw) for row in errors] == adaptations
+        and [row.episode for row in episodes]
+        == [number for adaptation in evaluator.adaptations for number in adaptation.episodes]
         and settings == {(plan.checkpoint, steps, plan.evaluation.learning_rate)}
     )
 
@@ -176,10 +177,10 @@ def _is_measured(folder: Path, evaluator: Evaluator, plan: CurvePlan, steps: int
 def _measure_imitation(run: FinishedRun, runner: Runner, evaluator: Evaluator, folder: Path) -> None:
     """Compare the adapted policies with demonstrations, and write a row for each."""
     outcomes = {}
-    with Bar("comparing with demonstrations", len(evaluator.trials)) as bar:
+    with Bar("comparing with demonstrations", len(evaluator.adaptations)) as bar:
         for index, outcome in runner.simulate("imitate", evaluator.calls(run.checkpoint)):
             outcomes[index] = outcome
-            bar.advance(1, evaluator.trials[index].task)
+            bar.advance(1, evaluator.adaptations[index].task)
     in_order = [outcomes[index] for index in range(len(outcomes))]
     write_rows(folder / IMITATION, evaluator.imitation(run.checkpoint, in_order))
 

@@ -19,7 +19,7 @@ from services.suites.base import Measure, measure_of
 
 MOST_TASKS = 3
 MOST_EPISODES = 20
-"""Of a task; whole trials are run, until there are so many."""
+"""Of a task; whole adaptations are run, until there are so many."""
 FAILED: dict[str, Any] = {"color": colour_of(3), "linestyle": "solid", "marker": "x"}
 SOLVED: dict[str, Any] = {"color": colour_of(0), "linestyle": "dashed", "marker": "o"}
 """A marker stands at the end of an episode."""
@@ -92,9 +92,9 @@ def _of_task(
 ) -> tuple[list[Part], list[list[str | int | float]]]:
     """Return what the page shows of a task, and a line of the table for each episode."""
     run, task = replay.run, rows[0].task
-    trials = sorted(_grouped(rows, lambda row: row.draw), key=_rate)
-    filmed = next(row for row in trials[0] if not row.success)
-    seen = _run_again(replay, trials, filmed if videos else None)
+    adaptations = sorted(_grouped(rows, lambda row: row.draw), key=_rate)
+    filmed = next(row for row in adaptations[0] if not row.success)
+    seen = _run_again(replay, adaptations, filmed if videos else None)
     measure = measure_of(run.experiment.suite, task)
     parts: list[Part] = [Prose(_told(rows, seen, measure))]
     if measure is not None and (drawn_ones := [one for one in seen if _course(one, measure).size]):
@@ -107,15 +107,17 @@ def _of_task(
     return parts, [_table_row(one, measure) for one in seen]
 
 
-def _run_again(replay: Replay, trials: Sequence[Sequence[EpisodeResult]], filmed: EpisodeResult | None) -> list[Seen]:
-    """Run whole trials, until there are enough episodes."""
+def _run_again(
+    replay: Replay, adaptations: Sequence[Sequence[EpisodeResult]], filmed: EpisodeResult | None
+) -> list[Seen]:
+    """Run whole adaptations, until there are enough episodes."""
     film = None if filmed is None else film_of(camera_of(replay.run), filmed.steps, FORMS["mp4"])
     seen: list[Seen] = []
-    for trial in trials:
+    for adaptation in adaptations:
         if len(seen) >= MOST_EPISODES:
             break
-        numbers = [filmed.episode] if filmed is not None and filmed in trial else []
-        seen += replay.trial(trial[0], film, numbers)
+        numbers = [filmed.episode] if filmed is not None and filmed in adaptation else []
+        seen += replay.rerun(adaptation[0], film, numbers)
     return sorted(seen, key=lambda one: one.row.episode)
 
 

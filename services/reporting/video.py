@@ -128,7 +128,7 @@ def _sides(replay: Replay, row: EpisodeResult, form: Form, *, demonstration: boo
         steps = len(footage.actions)
         title = f"demonstration {shown_first.id} of {row.task}"
         sides.append(Side(title, footage.frames, steps, None, True, f"demonstrated in {steps} steps"))
-    (seen,) = [seen for seen in replay.trial(row, film, [row.episode]) if seen.row.episode == row.episode]
+    (seen,) = [seen for seen in replay.rerun(row, film, [row.episode]) if seen.row.episode == row.episode]
     return [*sides, side_of(replay.run, seen)], seen
 
 

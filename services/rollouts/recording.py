@@ -106,7 +106,7 @@ def watch(
 ) -> list[Watched]:
     """Run the episodes that `rollout` runs, to the same bits, and watch them all.
 
-    All episodes of a trial have to be run for that: what a network gives for a state may differ in its last bits
+    All episodes of an adaptation have to be run for that: what a network gives for a state may differ in its last bits
     with the number of states beside it, and so may the whole course of an episode.
 
     Args:

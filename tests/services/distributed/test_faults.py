@@ -141,10 +141,10 @@ def test_a_trial_that_ends_its_workers_is_named(
     train("run", "--training.iterations", "1")
 
     class Deadly(SimulationWorker):
-        def try_out(self, method, parameters, shapes, trial, held_out, evaluation, seed):
-            if trial.task == "push":
+        def try_out(self, method, parameters, shapes, adaptation, held_out, evaluation, seed):
+            if adaptation.task == "push":
                 os.kill(os.getpid(), signal.SIGKILL)
-            return super().try_out(method, parameters, shapes, trial, held_out, evaluation, seed)
+            return super().try_out(method, parameters, shapes, adaptation, held_out, evaluation, seed)
 
     monkeypatch.setattr("services.distributed.ray_runner.SimulationWorker", Deadly)
     assert exit_code(meta_train.run, ["--resume", "run", "--runner", "ray", "--workers", "2"]) == 1

@@ -15,7 +15,7 @@ from services.suites.rendering import RenderingError
 
 @pytest.fixture
 def told_otherwise(finished: FinishedRun, tmp_path: Path):
-    """Return the run with other rows: those of the first trial, changed."""
+    """Return the run with other rows: those of the first adaptation, changed."""
 
     def change(**values: object) -> tuple[FinishedRun, EpisodeResult]:
         folder = tmp_path / "changed"
@@ -29,9 +29,9 @@ def told_otherwise(finished: FinishedRun, tmp_path: Path):
 
 def test_episodes_come_out_as_their_rows_say(finished: FinishedRun):
     rows = [row for row in finished.episodes if row.task in {"reach", "door-close"}]
-    by_trial = {(row.split, row.task, row.shots, row.draw): row for row in rows}
+    by_adaptation = {(row.split, row.task, row.shots, row.draw): row for row in rows}
     with replaying(finished) as replay:
-        seen = [one for row in by_trial.values() for one in replay.trial(row)]
+        seen = [one for row in by_adaptation.values() for one in replay.rerun(row)]
     assert [one.row for one in seen] == rows
     assert [one.difference for one in seen] == [None] * len(seen)
     for one in seen:
@@ -42,7 +42,7 @@ def test_episodes_come_out_as_their_rows_say(finished: FinishedRun):
 def test_what_comes_out_otherwise_is_named(told_otherwise):
     run, row = told_otherwise(steps=299, success=True)
     with replaying(run) as replay:
-        first, _ = replay.trial(row)
+        first, _ = replay.rerun(row)
     assert first.difference is not None
     assert first.difference.startswith(f"episode 0 of {row.task}, 1-shot: success False, where the run had True")
 
@@ -51,7 +51,7 @@ def test_only_what_is_to_be_filmed_is_filmed(finished: FinishedRun):
     row, film = finished.episodes[0], Film(finished.experiment.suite.camera, 100, 48, 64)  # type: ignore[attr-defined]
     with replaying(finished) as replay:
         try:
-            filmed, unfilmed = replay.trial(row, film, [row.episode])
+            filmed, unfilmed = replay.rerun(row, film, [row.episode])
         except RenderingError as error:
             pytest.skip(str(error))
     assert [frame.step for frame in filmed.footage.frames][:2] == [0, 100]
@@ -81,4 +81,4 @@ def test_its_demonstration_is_the_one_that_was_adapted_to(finished: FinishedRun)
 def test_an_episode_of_something_else_is_refused(told_otherwise, field: str, wrong: str, words: str):
     run, row = told_otherwise(**{field: wrong})
     with pytest.raises(ReplayError, match=words):
-        Replay(run).trial(row)
+        Replay(run).rerun(row)

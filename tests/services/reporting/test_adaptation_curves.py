@@ -14,7 +14,7 @@ from services.experiments.finished_run import FinishedRun, UnfinishedError
 from services.reporting.adaptation_curves import adaptation_section, measure, points
 from services.reporting.lineup import MismatchError, policy_after
 from services.reporting.page import DataTable, Prose, write_page
-from services.rollouts.trials import imitation_error
+from services.rollouts.adaptations import imitation_error
 
 TASK = "blue-green-red"
 Trained = Callable[..., FinishedRun]

@@ -15,7 +15,7 @@ from services.rollouts.episodes import Episode, rollout
 from services.suites.base import Environment, Split
 
 
-class Trial(NamedTuple):
+class Adaptation(NamedTuple):
     """One adaptation to one support set, and the episodes that judge it."""
 
     split: Split
@@ -31,7 +31,7 @@ class Trial(NamedTuple):
 
     @property
     def piece(self) -> dict[str, str | int]:
-        """What names it among all trials."""
+        """What names it among all adaptations."""
         return {"split": self.split, "task": self.task, "shots": self.shots, "draw": self.draw}
 
     def support(self, held_out: Sequence[Demonstration]) -> Sequence[Demonstration]:
@@ -59,18 +59,18 @@ def imitation_error(policy: Policy, demonstrations: Sequence[Demonstration]) -> 
     return total / sum(map(len, demonstrations))
 
 
-def trials(tasks: Sequence[tuple[Split, str]], evaluation: EvaluationConfig) -> list[Trial]:
+def plan_adaptations(tasks: Sequence[tuple[Split, str]], evaluation: EvaluationConfig) -> list[Adaptation]:
     """Return all adaptations of an evaluation, a task's episodes spread over its support sets."""
     return [
-        Trial(split, task, shots, draw, tuple(range(draw, evaluation.episodes, evaluation.support_draws)))
+        Adaptation(split, task, shots, draw, tuple(range(draw, evaluation.episodes, evaluation.support_draws)))
         for split, task in tasks
         for shots in evaluation.shots
         for draw in range(min(evaluation.support_draws, evaluation.episodes))
     ]
 
 
-class TrialOutcome(NamedTuple):
-    """The episodes of a trial, and the sub-skills along the held-out demonstrations it did not adapt to."""
+class AdaptationOutcome(NamedTuple):
+    """The episodes of an adaptation, and the sub-skills along the held-out demonstrations it did not adapt to."""
 
     episodes: list[Episode]
     use: list[SubSkillUse]
@@ -79,19 +79,19 @@ class TrialOutcome(NamedTuple):
 def try_out(
     method: Method,
     parameters: Parameters,
-    trial: Trial,
+    adaptation: Adaptation,
     held_out: Sequence[Demonstration],
     envs: Sequence[Environment],
     horizon: int,
     evaluation: EvaluationConfig,
     seed: int,
-) -> TrialOutcome:
-    """Adapt to a trial's support set and run its episodes: a pure function of its arguments.
+) -> AdaptationOutcome:
+    """Adapt to a support set and run the episodes that judge it: a pure function of its arguments.
 
     Args:
         method: what adapts.
         parameters: meta-trained.
-        trial: which support set and episodes.
+        adaptation: which support set and episodes.
         held_out: demonstrations of the task that meta-training has not seen.
         envs: of the task, at least one for each episode.
         horizon: steps in an episode.
@@ -99,12 +99,12 @@ def try_out(
         seed: of the experiment; an episode is named by it, the task and the episode's number, so that all shots
             and methods meet the same episodes.
     """
-    support = trial.support(held_out)
+    support = adaptation.support(held_out)
     policy = method.adapt(parameters, support, FineTuning(evaluation.fine_tuning_steps, evaluation.learning_rate))
-    seeds = [stream_seed(seed, "evaluation", trial.task, episode) for episode in trial.episodes]
+    seeds = [stream_seed(seed, "evaluation", adaptation.task, episode) for episode in adaptation.episodes]
     others = [demonstration for demonstration in held_out if demonstration not in support]
     episodes = rollout(policy, envs[: len(seeds)], seeds, horizon)
-    return TrialOutcome(episodes, [policy.sub_skill_use(demonstration) for demonstration in others])
+    return AdaptationOutcome(episodes, [policy.sub_skill_use(demonstration) for demonstration in others])
 
 
 class Imitation(NamedTuple):
@@ -119,12 +119,12 @@ class Imitation(NamedTuple):
 def imitate(
     method: Method,
     parameters: Parameters,
-    trial: Trial,
+    adaptation: Adaptation,
     held_out: Sequence[Demonstration],
     evaluation: EvaluationConfig,
 ) -> Imitation:
-    """Adapt to a trial's support set, and compare the policy with demonstrations: no episodes, else as `try_out`."""
-    support = trial.support(held_out)
+    """Adapt to a support set and compare the policy with demonstrations: no episodes, else as `try_out`."""
+    support = adaptation.support(held_out)
     policy = method.adapt(parameters, support, FineTuning(evaluation.fine_tuning_steps, evaluation.learning_rate))
     others = [demonstration for demonstration in held_out if demonstration not in support]
     return Imitation(imitation_error(policy, support), imitation_error(policy, others) if others else None)

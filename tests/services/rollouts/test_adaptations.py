@@ -8,8 +8,8 @@ import pytest
 from dmil_core.configs import DemonstrationConfig, EvaluationConfig, SuiteConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import Decision, Flat, SubSkillUse
+from services.rollouts.adaptations import imitation_error, plan_adaptations
 from services.rollouts.episodes import demonstrate, record, rollout
-from services.rollouts.trials import imitation_error, trials
 from services.suites.base import Environment, Expert
 from services.suites.metaworld import MetaWorldSuite
 
@@ -157,18 +157,18 @@ def test_an_expert_as_a_policy_solves_its_task(suite, make_envs):
 @pytest.mark.parametrize(("episodes", "draws"), [(20, 4), (7, 3), (2, 4), (5, 1)])
 def test_episodes_are_spread_evenly_over_disjoint_support_sets(episodes: int, draws: int):
     settings = EvaluationConfig(shots=(1, 3), episodes=episodes, support_draws=draws)
-    plan = trials([("meta-training", "reach"), ("meta-testing", "push")], settings)
+    plan = plan_adaptations([("meta-training", "reach"), ("meta-testing", "push")], settings)
     held_out = [
         Demonstration(str(index), "reach", np.zeros((1, 2), np.float32), np.zeros((1, 1), np.float32))
         for index in range(12)
     ]
     for task in ("reach", "push"):
         for shots in (1, 3):
-            of_one = [trial for trial in plan if (trial.task, trial.shots) == (task, shots)]
-            assert sorted(number for trial in of_one for number in trial.episodes) == list(range(episodes))
-            sizes = [len(trial.episodes) for trial in of_one]
+            of_one = [adaptation for adaptation in plan if (adaptation.task, adaptation.shots) == (task, shots)]
+            assert sorted(number for adaptation in of_one for number in adaptation.episodes) == list(range(episodes))
+            sizes = [len(adaptation.episodes) for adaptation in of_one]
             assert min(sizes) >= max(1, max(sizes) - 1)
-            support = [demonstration.id for trial in of_one for demonstration in trial.support(held_out)]
+            support = [demonstration.id for adaptation in of_one for demonstration in adaptation.support(held_out)]
             assert len(support) == len(set(support)) == shots * len(of_one)
 
 
