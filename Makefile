@@ -1,10 +1,10 @@
-# Setting up, training and testing from a clean checkout: needs Python 3.11 with venv, and nothing else.
+# Setting up, training and testing from a clean checkout: needs Python 3.11 with venv, and nothing else (but `test-all`).
 PYTHON := $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALLED := .venv/installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train cluster cluster-stop test check-deploy audit clean
+.PHONY: help setup train cluster cluster-stop test test-all missing tools check-deploy audit clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):[^#]*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -32,21 +32,46 @@ cluster: setup ## start a Ray head and an MLflow server on this machine, for Ray
 cluster-stop: setup ## stop these two
 	@$(BIN)/python -m services.local_cluster stop
 
-test: export OMP_NUM_THREADS = 1
-test: setup ## lint, format, types, then every test
-	$(BIN)/ruff check
-	$(BIN)/ruff format --check
-	$(BIN)/pyright
-	$(BIN)/lint-imports
-	$(BIN)/python -m pytest --ignore tests/deploy -m "not alone" -n 2 --dist loadfile --durations 10
-	$(BIN)/python -m pytest --ignore tests/deploy -m alone --durations 20
+define CHECK
+$(BIN)/ruff check
+$(BIN)/ruff format --check
+$(BIN)/pyright
+$(BIN)/lint-imports
+endef
 
-check-deploy: setup ## hold everything in deploy/ against schemas, checkers and the project itself; no container engine
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,deploy]'
+test test-all: export OMP_NUM_THREADS = 1
+test: setup ## what proves the product, in some minutes: lint, format, types, imports and tests
+	$(CHECK)
+	$(BIN)/python -m pytest -m "not thorough and not alone" -n 2 --dist loadfile --durations 10
+	$(BIN)/python -m pytest -m "alone and not thorough" --durations 10
+
+test-all: tools setup ## everything, also what wants a browser, a database, promtool, kubectl and half an hour
+	@$(INSTALL_CHECKERS)
+	$(CHECK)
+	$(BIN)/python -m pytest -m "not alone" -n 2 --dist loadfile --durations 20
+	$(BIN)/python -m pytest -m alone --durations 20
+
+MISSING = $(strip \
+	$(if $(shell command -v chromium),,chromium) \
+	$(if $(shell command -v promtool),,prometheus) \
+	$(if $(wildcard /usr/lib/postgresql/*/bin/postgres),,postgresql))
+INSTALL_CHECKERS = $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,deploy]'
+NEEDS_KUBECTL = command -v kubectl >/dev/null || \
+	{ echo "found no kubectl, 1.27 or newer, to render overlays: https://kubernetes.io/docs/tasks/tools"; exit 1; }
+
+missing: ## print which packages of apt-get test-all still wants
+	@echo $(MISSING)
+
+tools:
+	@test -z "$(MISSING)" || \
+		{ echo "test-all: found no $(MISSING): apt-get install --no-install-recommends $(MISSING)"; exit 1; }
+	@$(NEEDS_KUBECTL)
+
+check-deploy: setup ## of test-all, what holds deploy/ against schemas, checkers and the project; no container engine
 	@command -v promtool >/dev/null || { echo "check-deploy: found no promtool: apt-get install prometheus"; exit 1; }
-	@command -v kubectl >/dev/null || \
-		{ echo "check-deploy: found no kubectl, 1.27 or newer, to render overlays: https://kubernetes.io/docs/tasks/tools"; exit 1; }
-	$(BIN)/python -m pytest -m deploy tests/deploy
+	@$(NEEDS_KUBECTL)
+	@$(INSTALL_CHECKERS)
+	$(BIN)/python -m pytest tests/deploy
 
 audit: setup ## ask PyPI for known vulnerabilities of every pinned dependency; options go in ARGS, as ARGS="-s osv"
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[audit]'

@@ -1,4 +1,4 @@
-"""What holds for all tests: the environment of Ray and MLflow."""
+"""What holds for all tests: the environment of Ray and MLflow, and what the terminal is taken for."""
 
 import os
 import secrets
@@ -11,8 +11,10 @@ os.environ |= {
     "RAY_USAGE_STATS_ENABLED": "0",
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "OMP_NUM_THREADS": "1",
+    "TERM": "xterm-256color",
 }
 for _name in (
     "RAY_ADDRESS", "MLFLOW_TRACKING_URI", "MLFLOW_RUN_ID", "MLFLOW_EXPERIMENT_NAME", "DMIL_DATA", "DMIL_STORAGE",
+    "COLUMNS", "LINES", "FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE",
 ):  # fmt: skip
     os.environ.pop(_name, None)

@@ -38,7 +38,7 @@ def test_adaptation(tmp_path: Path) -> None:
     assert 0 < mil["floor_seconds"] < mil["seconds"]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.alone
 def test_simulation(tmp_path: Path) -> None:
     rows = rows_of("simulation", "--quick", folder=tmp_path)
@@ -51,7 +51,7 @@ def test_simulation(tmp_path: Path) -> None:
         assert row["physics_steps_per_s"] > 0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.alone
 def test_scaling(tmp_path: Path) -> None:
     rows = rows_of("scaling", "--sizes", "quick", "--rounds", "1", folder=tmp_path)
@@ -65,7 +65,7 @@ def test_scaling(tmp_path: Path) -> None:
         assert row["speedup"] == pytest.approx(row["iterations_per_s"] / rows[1]["iterations_per_s"])
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.alone
 def test_sizing(tmp_path: Path) -> None:
     given = ("--presets", "ml10-quick", "--rounds", "1", "--workers", "1", "2", "1000")
@@ -80,7 +80,7 @@ def test_sizing(tmp_path: Path) -> None:
     assert 0 < each[2]["tree"] < each[2]["alone"]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.alone
 def test_tracking(tmp_path: Path) -> None:
     rows = rows_of("tracking", "--rounds", "1", "--iterations", "2", folder=tmp_path)
@@ -94,7 +94,7 @@ def test_tracking(tmp_path: Path) -> None:
     assert [row["delivered"] for row in (down, slow, up)] == [0, 0, 7]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.alone
 @pytest.mark.timeout(1800)
 def test_faults(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from tests.deploy.manifests import (
     stages,
 )  # fmt: skip
 
-pytestmark = pytest.mark.deploy
+pytestmark = pytest.mark.thorough
 
 PAGES = ("docs/deploy.md", "docs/operations.md")
 

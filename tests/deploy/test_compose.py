@@ -10,7 +10,7 @@ import pytest
 from tests.deploy.command_lines import listening
 from tests.deploy.manifests import COMPOSE, DEPLOY, DOCKERFILE, ask, composed, documents, stages
 
-pytestmark = pytest.mark.deploy
+pytestmark = pytest.mark.thorough
 
 OTHERS = {"postgres": {5432}, "grafana": {3000}}
 """Ports of programs that need not be told."""

@@ -26,7 +26,7 @@ from tests.deploy.manifests import (
     stages,
 )  # fmt: skip
 
-pytestmark = pytest.mark.deploy
+pytestmark = pytest.mark.thorough
 
 TARGETS = ("cpu", "cuda", "mlflow", "store")
 IMAGE = re.compile(r"^(?P<name>[\w./-]+):(?P<tag>[\w.-]+)(?:@sha256:[0-9a-f]{64})?$")

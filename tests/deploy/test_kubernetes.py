@@ -27,7 +27,7 @@ from tests.deploy.manifests import (
     rendered,
 )  # fmt: skip
 
-pytestmark = pytest.mark.deploy
+pytestmark = pytest.mark.thorough
 
 SCHEMAS = Path(__file__).parent / "schemas"
 KUBERAY = {"RayCluster": "rayclusters.v1.json", "RayJob": "rayjobs.v1.json"}

@@ -11,7 +11,7 @@ from ray.autoscaler._private.util import prepare_config, validate_config
 from services.suites.rendering import BACKENDS
 from tests.deploy.manifests import DEPLOY, PROJECT, documents
 
-pytestmark = pytest.mark.deploy
+pytestmark = pytest.mark.thorough
 
 FILES = sorted(DEPLOY.glob("cluster*.yaml"))
 

@@ -13,7 +13,7 @@ from ray.dashboard.modules.reporter.reporter_agent import METRICS_GAUGES
 from services.distributed.metrics import MEASURES
 from tests.deploy.manifests import DEPLOY, PROJECT, ask, composed, documents
 
-pytestmark = pytest.mark.deploy
+pytestmark = pytest.mark.thorough
 
 PROMETHEUS, GRAFANA = DEPLOY / "prometheus", DEPLOY / "grafana"
 RULES = documents(PROMETHEUS / "alerts.yaml")[0]["groups"][0]["rules"]

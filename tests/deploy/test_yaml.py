@@ -6,7 +6,7 @@ import pytest
 
 from tests.deploy.manifests import DEPLOY, PROJECT, ask
 
-pytestmark = pytest.mark.deploy
+pytestmark = pytest.mark.thorough
 
 RULES = PROJECT / ".yamllint"
 

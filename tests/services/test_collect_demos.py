@@ -38,7 +38,7 @@ def test_verify_counts_successes(capsys: pytest.CaptureFixture[str]):
     assert [row[:3] for row in table(printed)] == [["reach", "6/6", "1.000"], ["all", "6/6", "1.000"]]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("joined")
 def test_verify_shows_scores_where_there_are_any(capsys: pytest.CaptureFixture[str]):
     collect_demos.run(["verify", "--suite", "kitchen", "--tasks", "light", "slide-light", "--seeds", "2"])
@@ -64,7 +64,6 @@ def test_inspect_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "wanted the 30 of a state" in capsys.readouterr().out
 
 
-@pytest.mark.slow
 def test_inspect_replays_in_the_kitchen(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch):
     monkeypatch.setenv("DMIL_DATA", str(tmp_path))
     flags = (

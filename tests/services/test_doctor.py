@@ -58,7 +58,6 @@ def test_the_facts_of_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert not facts(str(tmp_path), "mark").draws
 
 
-@pytest.mark.slow
 def test_a_machine_is_examined_and_left_as_it_was(programs, workplace: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("OMP_NUM_THREADS")
     code, printed = programs("doctor")
@@ -74,7 +73,6 @@ def test_a_machine_is_examined_and_left_as_it_was(programs, workplace: Path, mon
     assert "secret" not in printed
 
 
-@pytest.mark.slow
 def test_a_cluster_is_examined_by_node(programs, workplace: Path, joined):
     code, printed = programs("doctor")
     assert "shared storage" not in printed  # one node shares with nobody

@@ -55,7 +55,6 @@ def ended(processes: list[psutil.Process]) -> bool:
     return not any(process.is_running() and process.status() != psutil.STATUS_ZOMBIE for process in processes)
 
 
-@pytest.mark.slow
 @pytest.mark.alone
 def test_a_cluster_takes_jobs_with_its_token_and_leaves_nothing_behind(started, programs, answers, wait_for):
     folder, printed = started
@@ -70,12 +69,12 @@ def test_a_cluster_takes_jobs_with_its_token_and_leaves_nothing_behind(started, 
 
     command = next(line for line in printed.splitlines() if "job submit" in line).partition(" -- ")[0]
     job = f"{sys.executable} -c \"import os; print('to', os.environ['MLFLOW_TRACKING_URI'], os.getcwd())\""
-    submitted = subprocess.run(f"{command} -- {job}", shell=True, capture_output=True, text=True, timeout=120)
+    submitted = subprocess.run(f"{command} -- {job}", shell=True, capture_output=True, text=True)
     assert submitted.returncode == 0, submitted.stdout + submitted.stderr
     assert f"to {mlflow} {folder.parent}" in submitted.stdout
     for environment, complaint in (({}, "Missing"), ({"RAY_AUTH_TOKEN": "0" * 64}, "Invalid")):
         refused = subprocess.run(
-            [*SUBMIT, "--address", dashboard, "--", "true"], capture_output=True, text=True, timeout=120,
+            [*SUBMIT, "--address", dashboard, "--", "true"], capture_output=True, text=True,
             env={**os.environ, "RAY_AUTH_MODE": "token" if environment else "disabled", **environment},
         )  # fmt: skip
         assert refused.returncode == 1
@@ -96,7 +95,7 @@ def test_a_cluster_takes_jobs_with_its_token_and_leaves_nothing_behind(started, 
     assert "got no cluster.json" in said
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.alone
 def test_what_is_left_of_a_killed_cluster_is_stopped_by_the_next_start(started, programs, ports):
     folder, _ = started

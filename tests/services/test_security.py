@@ -66,7 +66,6 @@ def test_loopback_is_told_from_the_rest(address: str, wanted: bool):
     assert on_loopback(address) == wanted
 
 
-@pytest.mark.slow
 @pytest.mark.alone
 def test_a_cluster_as_the_readme_starts_it_listens_on_loopback(cluster):
     port = int(cluster.address.rpartition(":")[2])
@@ -93,7 +92,7 @@ sys.exit(exit_code(meta_train.run, sys.argv[1:]))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.alone
 def test_a_run_on_ray_listens_on_loopback_and_keeps_its_secrets_when_it_fails(
     workplace: Path, short_folder: Path, free_port, wait_for, monkeypatch
@@ -115,7 +114,7 @@ def test_a_run_on_ray_listens_on_loopback_and_keeps_its_secrets_when_it_fails(
     checkpoints = Checkpoints(workplace / "runs" / "run" / "checkpoints", 3)
     wait_for(lambda: bool(checkpoints.all()) or program.poll() is not None, "the first checkpoint")
     found = listening(program.pid)
-    program.wait(120)
+    program.wait()
     printed = (workplace / "printed").read_text()
     assert found, printed
     assert {address: who for address, who in found.items() if not on_loopback(address)} == {}
@@ -130,7 +129,7 @@ def test_a_run_on_ray_listens_on_loopback_and_keeps_its_secrets_when_it_fails(
         assert holding(secret, workplace, short_folder) == [], name
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.alone
 def test_a_whole_run_keeps_its_secrets(programs, train, workplace: Path, monkeypatch):
     planted = secrets.token_hex(32)
@@ -172,7 +171,7 @@ def test_a_refused_tracker_tells_no_secret(tmp_path: Path, where: str, scheme: s
         monkeypatch.setenv("MLFLOW_TRACKING_USERNAME", "user" if "PASSWORD" in where else "")
         monkeypatch.setenv(where, planted)
     tracker = Tracker(tmp_path, "refused")
-    wait_for(lambda: bool(logged()), "a refusal", 30)
+    wait_for(lambda: bool(logged()), "a refusal")
     assert not tracker.close("FINISHED")
     server.shutdown()
     server.server_close()
@@ -182,7 +181,6 @@ def test_a_refused_tracker_tells_no_secret(tmp_path: Path, where: str, scheme: s
     assert all(planted not in path.read_text() for path in tmp_path.iterdir())
 
 
-@pytest.mark.slow
 @pytest.mark.alone
 @pytest.mark.parametrize(
     ("environment", "refusal"),
@@ -199,7 +197,7 @@ def test_a_stranger_s_job_is_refused(cluster, tmp_path: Path, environment: dict[
         "touch", str(tmp_path / "ran"),
     ]  # fmt: skip
     submitted = subprocess.run(
-        command, env={**without, **environment, "HOME": str(tmp_path)}, capture_output=True, text=True, timeout=120
+        command, env={**without, **environment, "HOME": str(tmp_path)}, capture_output=True, text=True
     )
     assert submitted.returncode != 0
     assert refusal in (printed := submitted.stdout + submitted.stderr), printed
@@ -209,7 +207,7 @@ def test_a_stranger_s_job_is_refused(cluster, tmp_path: Path, environment: dict[
         f"{cluster.dashboard}/api/jobs/", body, {"Content-Type": "application/json", **token}
     )
     with pytest.raises(urllib.error.HTTPError) as refused:
-        urllib.request.urlopen(request, timeout=30)
+        urllib.request.urlopen(request)
     assert refused.value.code == (403 if token else 401)
     refused.value.close()
 

@@ -2,16 +2,21 @@
 
 import subprocess
 import sys
+from contextlib import suppress
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import services
 from dmil_core.configs import PRESETS
 from services.cli.arguments import PROGRAMS, ConfigError, parse
 from services.cli.composition import config_from
 from services.meta_train import Arguments, run
+
+SERVICES = Path(services.__path__[0])
 
 
 def settings(*flags: str, preset: str = "ml10-smoke", file: Path | None = None) -> Any:
@@ -119,33 +124,27 @@ def test_a_file_that_cannot_be_read_is_named(file: str):
         config_from("ml10-smoke", Path(file))
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [("--method.order", "third"), ("--method.sub-skills", "0"), ("--config", "nowhere.yaml")],
-    ids=" ".join,
-)
-def test_a_mistake_ends_the_program_with_exit_code_2(programs, arguments):
-    code, printed = programs("meta_train", *arguments)
+def test_a_mistake_ends_the_program_with_exit_code_2(programs):
+    code, printed = programs("meta_train", "--method.order", "third")
     assert code == 2
-    assert arguments[-1] in printed
+    assert "third" in printed
     assert "Traceback" not in printed
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_each_program_explains_itself(programs, name: str):
-    code, printed = programs(name.replace("-", "_"), "--help")
-    assert code == 0
-    assert f"usage: python -m services.{name.replace('-', '_')} " in printed
-    assert {"tune-sweep": "--scale", "report": "tables", "doctor": "--runs"}.get(name, "--runner") in printed
+@pytest.mark.parametrize(
+    "name", [path.stem for path in sorted(SERVICES.glob("[a-z]*.py")) if path.stem != "checkpoints"]
+)
+def test_each_program_explains_itself(name: str, capsys: pytest.CaptureFixture[str]):
+    with suppress(SystemExit):
+        import_module(f"services.{name}").run(["--help"])
+    assert f"usage: python -m services.{name} " in capsys.readouterr().out
 
 
 def test_the_console_script_lists_the_programs():
     dmil = Path(sys.executable).with_name("dmil")
-    listed = subprocess.run([dmil, "--help"], capture_output=True, text=True, timeout=60)
+    listed = subprocess.run([dmil, "--help"], capture_output=True, text=True)
     assert listed.returncode == 0
     assert all(name in listed.stdout for name in PROGRAMS)
-    unknown = subprocess.run([dmil, "fly"], capture_output=True, text=True, timeout=60)
+    unknown = subprocess.run([dmil, "fly"], capture_output=True, text=True)
     assert unknown.returncode == 2
     assert "got the program 'fly'; wanted one of meta-train" in unknown.stderr
-    helped = subprocess.run([dmil, "evaluate", "--help"], capture_output=True, text=True, timeout=60)
-    assert (helped.returncode, "--checkpoint" in helped.stdout) == (0, True)

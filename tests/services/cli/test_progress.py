@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import termios
-import time
 from collections.abc import Callable, Iterator
 from io import StringIO
 from typing import NamedTuple
@@ -30,11 +29,10 @@ class Terminal(NamedTuple):
     def resize(self, columns: int, rows: int) -> None:
         termios.tcsetwinsize(self.screen, (rows, columns))
 
-    def read(self, until: Callable[[str], bool], seconds: float = 120) -> str:
+    def read(self, until: Callable[[str], bool]) -> str:
         """Return what is sent, up to where it is what one waits for, or all that there is when its programs ended."""
-        sent, end = b"", time.monotonic() + seconds
+        sent = b""
         while not until(sent.decode(errors="ignore")):
-            assert time.monotonic() < end, sent.decode(errors="ignore")
             if select.select([self.screen], [], [], 0.2)[0]:
                 try:
                     sent += os.read(self.screen, 65536)
@@ -66,7 +64,6 @@ def terminal() -> Iterator[Terminal]:
     os.close(terminal.screen)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("programs")
 def test_a_terminal_shows_one_screen_and_is_left_as_it_was(terminal: Terminal):
     program = terminal.start("--training.iterations", "100000", "--training.checkpoint-every", "20")
@@ -78,7 +75,7 @@ def test_a_terminal_shows_one_screen_and_is_left_as_it_was(terminal: Terminal):
         sent += terminal.read(lambda sent: sent.count("meta-training") > 2)
     os.killpg(program.pid, signal.SIGINT)
     sent += terminal.read(lambda sent: False)
-    assert program.wait(60) == 130
+    assert program.wait() == 130
     assert "Traceback" not in sent
     assert "stopped; to go on: python -m services.meta_train --resume runs/run" in sent
     assert sent.rindex(SHOWN) > sent.rindex(HIDDEN)
@@ -87,13 +84,13 @@ def test_a_terminal_shows_one_screen_and_is_left_as_it_was(terminal: Terminal):
     assert "meta-training " in after, "a line that says how far it came"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("programs")
 def test_a_quiet_terminal_gets_lines_and_results(terminal: Terminal):
     arguments = ["--training.iterations", "4", "--training.checkpoint-every", "2", "--evaluation.every", "2"]
     program = terminal.start("--quiet", *arguments)
     sent = terminal.read(lambda sent: False)
-    assert program.wait(60) == 0, sent
+    assert program.wait() == 0, sent
     assert HIDDEN not in sent
     assert "\nmeta-training 4/4, " in sent
     assert "\nevaluating 16/16, " in sent

@@ -1,7 +1,6 @@
 """Demonstrations in npz files: read as numpy wrote them, refused by name, and never unpacked when they are bombs."""
 
 import io
-import time
 import tracemalloc
 import zipfile
 from collections.abc import Callable
@@ -146,12 +145,10 @@ def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, declared: i
     content = bomb(100)
     path.write_bytes(content if declared is None else as_declared(content, declared))
     tracemalloc.start()
-    began = time.monotonic()
     try:
         with pytest.raises(DemonstrationError, match=r"bomb.npz: .*(packed into|BadZipFile|bytes for)"):
             read_npz(path, "kettle")
         assert tracemalloc.get_traced_memory()[1] < 2 * 10**7
-        assert time.monotonic() - began < 5
     finally:
         tracemalloc.stop()
 

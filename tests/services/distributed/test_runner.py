@@ -25,9 +25,8 @@ def cut(groups: int, size: int) -> list[slice]:
     return [slice(first, first + size) for first in range(0, groups, size)]
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("joined")
-@pytest.mark.parametrize(("slots", "group"), [(5, 1), (7, 3)])
+@pytest.mark.parametrize(("slots", "group"), [pytest.param(5, 1, marks=pytest.mark.thorough), (7, 3)])
 def test_any_number_of_workers_ends_with_the_same_bits(config, store: DemoStore, data, slots: int, group: int):
     experiment = Experiment(training(config, slots, group), store)
     wanted = alone(experiment, data)
@@ -45,7 +44,7 @@ def test_any_number_of_workers_ends_with_the_same_bits(config, store: DemoStore,
             meta_training.close()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("joined")
 def test_neither_the_fan_in_nor_the_blocks_change_a_bit(
     config, store: DemoStore, data, monkeypatch: pytest.MonkeyPatch
@@ -85,7 +84,15 @@ def test_the_groups_are_part_of_the_result(config, store: DemoStore, data):
 
 @pytest.mark.usefixtures("joined")
 @pytest.mark.parametrize(
-    ("where", "slots"), [("between two iterations", 5), ("gradient", 5), ("add", 5), ("gradient", 2), ("add", 2)]
+    ("where", "slots"),
+    [
+        ("gradient", 5),
+        ("add", 5),
+        *(
+            pytest.param(*case, marks=pytest.mark.thorough)
+            for case in (("between two iterations", 5), ("gradient", 2), ("add", 2))
+        ),
+    ],
 )
 def test_a_killed_worker_changes_nothing(
     config, store: DemoStore, data, where: str, slots: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -52,7 +52,6 @@ def promote(runs: Mapping[str, Path], tmp_path: Path, capsys: pytest.CaptureFixt
     return promote
 
 
-@pytest.mark.slow
 def test_the_alias_moves_to_what_is_better_outside_its_interval_only(promote, runs: Mapping[str, Path], complaint):
     arguments = ["--runner", "local", "--promote"]
     told = complaint(evaluate.run, "--checkpoint", str(runs["worse"]), *arguments)
@@ -80,7 +79,6 @@ def test_the_alias_moves_to_what_is_better_outside_its_interval_only(promote, ru
     }
 
 
-@pytest.mark.slow
 def test_what_cannot_be_promoted_is_told_before_the_evaluation(
     promote, runs: Mapping[str, Path], tmp_path: Path, complaint, monkeypatch: pytest.MonkeyPatch
 ):

@@ -16,8 +16,9 @@ KNOWN = json.loads(Path(__file__).with_name("same_bits.json").read_text())
 OLD = Path(__file__).with_name("old_checkpoints")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.thorough) if name.endswith("-1") else name for name in RUNS]
+)
 def test_a_run_comes_to_the_same_bits_as_ever(workplace: Path, name: str):
     if processor() not in KNOWN:
         pytest.skip(f"no digests for {processor()}; write them down by python -m tests.services.experiments.same_bits")

@@ -48,20 +48,20 @@ def set_up(spare_bytes: int) -> None:
     limit = pages * resource.getpagesize() + spare_bytes
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     sys.addaudithook(_notice)
-    signal.signal(signal.SIGALRM, _too_long)
+    signal.signal(signal.SIGPROF, _too_long)
     sys.dont_write_bytecode = True  # of what a reader imports late
 
 
 @contextmanager
 def guarded(seconds: float) -> Iterator[None]:
-    """Raise GuardError if what is done inside takes longer, or writes, deletes, starts or connects to anything."""
+    """Raise GuardError if what is done inside takes more processor time, or writes, deletes, starts or connects."""
     global _seen
     _seen = seen = []
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
         _seen = None
         if seen:
             raise GuardError("; ".join(seen))

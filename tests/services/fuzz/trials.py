@@ -21,7 +21,7 @@ from readers import READERS, Reader
 from dmil_core.errors import UserError
 
 SECONDS = 10.0
-"""For one input; the slowest honest ones take a tenth of that where others work too."""
+"""On a processor, for one input; the slowest honest ones take a tenth of that."""
 SPARE_BYTES = 2**28
 LONGEST_MESSAGE = 5000
 

@@ -148,7 +148,7 @@ def test_a_damaged_plan_is_told(trained: Trained):
         adaptation_section(run)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("joined")
 def test_ray_measures_the_same(trained: Trained):
     """On a suite that Ray's workers know too: one of ours."""

@@ -56,7 +56,6 @@ def test_each_demonstration_keeps_its_first_state_and_every_other():
     assert kept.of.tolist() == kept.states[:, 0].tolist() == [0, 2, 4, 5, 7]
 
 
-@pytest.mark.fuzz
 @given(st.lists(st.integers(1, 30), min_size=1, max_size=6), st.integers(1, 60))
 def test_no_less_would_do(lengths: list[int], most: int):
     kept = thin_out(demonstrations(*lengths), most)

@@ -3,7 +3,6 @@
 from itertools import pairwise
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -50,7 +49,6 @@ def test_nothing_at_all_has_no_share_of_anything():
     assert (use.episodes, use.steps, use.switches, use.shares.tolist()) == (0, 0, 0.0, [0.0, 0.0])
 
 
-@pytest.mark.fuzz
 @given(TIMELINES)
 def test_it_agrees_with_counting_step_by_step(episodes: list[list[int]]):
     use = usage([timeline(*episode) for episode in episodes], 4)
@@ -69,7 +67,6 @@ def test_it_agrees_with_counting_step_by_step(episodes: list[list[int]]):
     assert use.switches == sum(one != other for one, other in pairs) / len(episodes)
 
 
-@pytest.mark.fuzz
 @given(st.lists(st.integers(0, 3), max_size=30))
 def test_stretches_laid_end_to_end_are_the_timeline(steps: list[int]):
     found = segments(timeline(*steps))

@@ -34,7 +34,7 @@ def server(free_port: Callable[[], int], answers, wait_for, tmp_path_factory) ->
     wait_for(lambda: answers(f"http://127.0.0.1:{port}"), "the S3 server")
     yield f"http://127.0.0.1:{port}"
     process.terminate()
-    process.wait(10)
+    process.wait()
 
 
 @pytest.fixture(params=["file", "s3"])
@@ -127,7 +127,7 @@ def test_killed_between_parts_it_leaves_whole_checkpoints_only(url: str, train, 
     train("run", "--training.iterations", "4", "--training.checkpoint-every", "2")
     folder, storage = workplace / "runs" / "run", Storage(url)
     first, second = sorted(path.name for path in (folder / "checkpoints").iterdir())
-    killed = subprocess.run([sys.executable, "-c", KILLED, str(folder), url, str(parts)], timeout=60)
+    killed = subprocess.run([sys.executable, "-c", KILLED, str(folder), url, str(parts)])
     assert killed.returncode == -signal.SIGKILL
     assert names(storage) == set([first, second][: parts // 5])
     elsewhere = workplace / "elsewhere" / "run"

@@ -136,14 +136,13 @@ def test_the_expert_does_each_sub_task(sub_task):
         assert all(row.steps < 150 for row in rows), rows
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("task", PAPER)
 def test_the_expert_does_the_papers_chains(task):
     rows = verify(SUITE, task, range(2), 0.1)
     assert [(row.success, row.score) for row in rows] == [(True, 4)] * 2, rows
 
 
-@pytest.mark.slow
 def test_a_replayed_demonstration_does_what_it_did():
     env = SUITE.make_env("microwave")
     attempt = demonstrate(

@@ -200,7 +200,6 @@ def test_a_hidden_goal_is_zero_and_the_rest_is_equal(task):
         assert hidden_info["success"] == info["success"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("task", [task for task in TASKS if task != "push-around-wall"])
 def test_hidden_goals_are_hidden_as_meta_world_hides_them(task):
     stock: Any = ALL_V3_ENVIRONMENTS_GOAL_HIDDEN[f"{task}-v3-goal-hidden"]()

@@ -17,6 +17,7 @@ from services.suites.metaworld import MetaWorldSuite, SeededEpisodes
 from services.suites.metaworld_speed import fast_environment, quaternion
 
 ALL_TASKS = sorted(name.removesuffix("-v3") for name in ENV_POLICY_MAP)
+SMOKE_TASKS = {"reach", "push", "drawer-close", "door-close"}
 EXPERT_STEPS, TRAILING_STEPS, RANDOM_STEPS = 200, 10, 60
 
 
@@ -61,8 +62,9 @@ def compare(task: str, envs: list[Env], seed: int, *, with_expert: bool) -> bool
     return solved_at is not None
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("task", ALL_TASKS)
+@pytest.mark.parametrize(
+    "task", [task if task in SMOKE_TASKS else pytest.param(task, marks=pytest.mark.thorough) for task in ALL_TASKS]
+)
 def test_episodes_are_those_of_meta_world_to_the_bit(task: str):
     """Observations, successes and, where asked for, rewards and all else that a step's info holds."""
     suite = MetaWorldSuite(SuiteConfig())

@@ -85,7 +85,7 @@ def write_npz(path: Path, dims: tuple[int, int] = (9, 2), demonstrations: int = 
     return f"npz:{path}"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_an_installed_suite_is_meta_trained_to_its_table(package: Path, programs, workplace: Path, monkeypatch):
     paths = filter(None, (os.environ.get("PYTHONPATH"), str(package)))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
@@ -106,7 +106,6 @@ def test_an_installed_suite_is_meta_trained_to_its_table(package: Path, programs
     ]
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("plug_in")
 def test_a_run_learns_a_task_from_a_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     mine = write_npz(tmp_path / "mine.npz")

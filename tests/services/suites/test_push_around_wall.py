@@ -67,7 +67,7 @@ def test_the_expert_solves_it(env, noise):
     assert solved(env, range(5), noise) == 5
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("noise", [0.0, 0.1])
 def test_the_expert_solves_95_of_100_seeds(env, noise):
     assert solved(env, range(100), noise) >= 95
@@ -292,7 +292,6 @@ def test_a_spoiled_path_earns_no_more_than_its_grasp():
         assert reward == 2 * info["grasp_reward"]
 
 
-@pytest.mark.slow
 def test_the_fast_environment_is_equal_to_the_bit():
     stock, rewarded, fast = envs = stock_env(), make_env(rewards=True), make_env()
     solved = []

@@ -26,7 +26,6 @@ def draw(env: Environment, camera: str, height: int = 90, width: int = 120) -> n
         pytest.skip(str(error))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [(90, 120), (500, 600)])
 def test_a_picture_has_the_size_that_was_asked_for(env, size):
     drawn = draw(env, "corner2", *size)
@@ -34,7 +33,6 @@ def test_a_picture_has_the_size_that_was_asked_for(env, size):
     assert drawn.std() > 10
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("camera", ["corner", "corner2", "corner4"])
 def test_a_picture_is_upright(env, camera):
     """These cameras see a plain sky along the upper edge, the robot, its table or the floor along the lower one."""
@@ -43,7 +41,6 @@ def test_a_picture_is_upright(env, camera):
     assert upper < lower
 
 
-@pytest.mark.slow
 def test_a_picture_shows_what_happens_and_changes_nothing():
     def episode(*, drawn: bool) -> tuple[np.ndarray, list[np.ndarray]]:
         env = MetaWorldSuite(SuiteConfig()).make_env("push-wall")

@@ -223,7 +223,6 @@ def test_suites_in_the_rows_are_tasks_of_one_profile(tmp_path: Path, open_page) 
     assert all("kitchen-kettle: " in told for told in maps)
 
 
-@pytest.mark.slow
 def test_real_runs_with_evaluations_on_the_way(train, workplace: Path, open_page) -> None:
     settings = ["--training.iterations", "4", "--training.checkpoint-every", "2", "--evaluation.every", "2"]
     for seed in ("0", "1"):

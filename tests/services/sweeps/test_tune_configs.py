@@ -65,8 +65,9 @@ def sweep(programs, runs: Path, runs_of, mlflow_file: str, joined) -> Callable[[
     return run
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.parametrize(
+    "name", [name if name == "em" else pytest.param(name, marks=pytest.mark.thorough) for name in ROWS]
+)
 def test_each_sweep_ends_with_its_table(sweep, mlflow_file: str, name: str) -> None:
     tables, parent, children = sweep(name)
     artifacts = [found.path for found in MlflowClient(mlflow_file).list_artifacts(parent.info.run_id, "tables")]
@@ -91,7 +92,7 @@ def test_each_sweep_ends_with_its_table(sweep, mlflow_file: str, name: str) -> N
     assert flat == FLAT & set(ROWS[name])
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_search_stops_the_worse_and_names_the_best(sweep, runs: Path) -> None:
     tables, _, children = sweep("search")
     assert len(tables["samples"]) == len(children) == 4

@@ -17,7 +17,7 @@ from services.tracking.delivery import Identity
 from services.tracking.links import comparison_link, run_link
 from tests.services.conftest import QUICK_EVALUATION, Server
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.thorough
 MILLISECONDS = 60_000
 
 

@@ -2,7 +2,6 @@
 
 import signal
 import threading
-import time
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -92,12 +91,12 @@ def test_what_was_not_delivered_is_delivered_by_the_next_tracker(
 
 @pytest.fixture
 def slow_server() -> Iterator[tuple[str, threading.Event]]:
-    """The address of a server that waits ten seconds before each answer, and what ends the waiting."""
+    """The address of a server that answers nobody before it is allowed to."""
     over = threading.Event()
 
     class Slow(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            over.wait(10)
+            over.wait()
             self.send_error(503)
 
         do_POST = do_GET  # noqa: N815
@@ -114,32 +113,26 @@ def slow_server() -> Iterator[tuple[str, threading.Event]]:
     server.server_close()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.alone
 def test_a_slow_server_is_not_waited_for(
     slow_server: tuple[str, threading.Event], tmp_path: Path, mlflow_file: str, monkeypatch
 ):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", slow_server[0])
     tracker = Tracker(tmp_path, "slow")
-    began = time.monotonic()
     for step in range(1, 101):
         tracker.metrics(step, {"loss": 1 / step})
         tracker.identify(patience=0)
-    assert time.monotonic() - began < 1
     assert tracker.identify() is None
-    assert time.monotonic() - began < 9, "one call of over five seconds tells"
-    began = time.monotonic()
     assert not tracker.close("FINISHED")
-    assert time.monotonic() - began < 5
     slow_server[1].set()
-    tracker._thread.join(15)
+    tracker._thread.join()
 
     monkeypatch.setenv("MLFLOW_TRACKING_URI", mlflow_file)
     tracking_program(["flush", str(tmp_path)])
     assert steps(mlflow_file, Identity.of(tmp_path).run_id, "loss") == list(range(1, 101))
 
 
-@pytest.mark.slow
 @pytest.mark.alone
 def test_a_killed_run_that_goes_on_has_every_iteration_once(
     programs, train, wait_for, workplace: Path, mlflow_file: str
@@ -156,7 +149,7 @@ def test_a_killed_run_that_goes_on_has_every_iteration_once(
         saved = checkpoints.newest().manifest.iteration if checkpoints.all() else 0
         return saved > 0 and Identity.of(folder).delivered > 10 and done[-1] % 7 > 2
 
-    wait_for(further, "iterations beyond a checkpoint", 60)
+    wait_for(further, "iterations beyond a checkpoint")
     program.send_signal(signal.SIGKILL)
     program.communicate()
     saved, recorded = checkpoints.newest().manifest.iteration, records(folder, "metrics")[-1].step
@@ -178,7 +171,7 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
     server.stop()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.alone
 def test_a_server_takes_records_also_those_of_the_time_it_was_away(server: Server, tmp_path: Path, wait_for, logged):
     folder = tmp_path / "run"

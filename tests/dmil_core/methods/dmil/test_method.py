@@ -129,7 +129,7 @@ def test_adaptation_leaves_the_parameters(method, demonstrations, steps: int) ->
 
 
 @pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize("order", ["first", "second"])
+@pytest.mark.parametrize("order", [pytest.param("first", marks=pytest.mark.thorough), "second"])
 def test_learns_to_tell_two_skills_apart_in_a_new_task(order: Literal["first", "second"]) -> None:
     config = DmilConfig(
         sub_skills=2,

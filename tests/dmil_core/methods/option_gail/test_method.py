@@ -233,7 +233,7 @@ def test_tells_two_skills_apart_in_a_new_task_offline() -> None:
     assert np.mean(successes) >= 0.9
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("unchecked")
 def test_practice_against_the_discriminator_makes_more_of_a_poor_start() -> None:
     sets = {"task-0": training_sets(1)["task-0"]}
