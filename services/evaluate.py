@@ -11,7 +11,8 @@ from pathlib import Path
 import tyro
 
 from dmil_core.configs import EvaluationConfig
-from services.cli.arguments import ConfigError, Quiet, exit_code, parse, peek
+from dmil_core.errors import UserError
+from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import with_evaluation
 from services.cli.progress import Clock, console
 from services.demonstrations.store import open_store
@@ -56,7 +57,7 @@ def run(arguments: Sequence[str]) -> None:
     config = with_evaluation(checkpoint.manifest.config, given.evaluation)
     if given.tasks is not None:
         if given.promote:
-            raise ConfigError("--promote: got --tasks with it; wanted all of the suite's, by which models are compared")
+            raise UserError("--promote: got --tasks with it; wanted all of the suite's, by which models are compared")
         config = config.model_copy(update={"suite": config.suite.model_copy(update={"test_tasks": given.tasks})})
     experiment = Experiment(config, open_store())
     given.output.mkdir(parents=True, exist_ok=True)

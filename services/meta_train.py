@@ -15,8 +15,8 @@ import tyro
 from pydantic import ValidationError
 
 from dmil_core.configs import DEFAULT_METHOD, ExperimentConfig
-from dmil_core.errors import explain
-from services.cli.arguments import ConfigError, Quiet, exit_code, parse, peek
+from dmil_core.errors import UserError, explain
+from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import DEFAULT_PRESET, defaults_from
 from services.cli.progress import Clock, console
 from services.demonstrations.store import open_store
@@ -139,7 +139,7 @@ def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]
         folder = new_folder(given.name or f"{kind}-{datetime.now():%Y%m%d-%H%M%S}", given.runs, MARK)
         return given, folder, None
     if early.preset or early.config or early.suite or early.method or early.demos:
-        raise ConfigError(
+        raise UserError(
             "--resume: got --preset, --config, --suite, --method or --demos with it; wanted none: a run goes on with "
             "its own settings"
         )
@@ -152,7 +152,7 @@ def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]
         before = ExperimentConfig.model_validate_json(read_file(folder / MARK, MOST_BYTES))
     except (OSError, ValidationError) as error:
         got = explain(error) if isinstance(error, ValidationError) else error
-        raise ConfigError(f"{folder / 'config.json'}: {got}; start a new run") from error
+        raise UserError(f"{folder / 'config.json'}: {got}; start a new run") from error
     given = parse(Arguments, __doc__ or "", arguments, Arguments(before))
     _same_run(before, given.experiment)
     saved = Checkpoints(folder / "checkpoints", given.experiment.training.checkpoints_kept)
@@ -163,13 +163,13 @@ def _same_run(before: ExperimentConfig, now: ExperimentConfig) -> None:
     """Refuse to go on under other settings than the run began with.
 
     Raises:
-        ConfigError: names the sections that differ.
+        UserError: names the sections that differ.
     """
     old, new = before.model_dump(exclude={"evaluation"}), now.model_dump(exclude={"evaluation"})
     for setting in CHANGEABLE:
         del old["training"][setting], new["training"][setting]
     if changed := [section for section in old if old[section] != new[section]]:
-        raise ConfigError(
+        raise UserError(
             f"--resume: got other settings of {', '.join(changed)} than the run began with; wanted the same, except "
             f"for evaluation and training's {', '.join(sorted(CHANGEABLE))}; start a new run for others"
         )

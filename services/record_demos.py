@@ -9,7 +9,8 @@ import numpy as np
 import tyro
 
 from dmil_core.demonstrations import Demonstration
-from services.cli.arguments import ConfigError, exit_code, parse
+from dmil_core.errors import UserError
+from services.cli.arguments import exit_code, parse
 from services.cli.composition import suite_settings
 from services.cli.progress import console
 from services.demonstrations.external import FORMS, demonstrations
@@ -37,7 +38,7 @@ def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, tyro.MISSING, tyro.MISSING))
     if given.source.partition(":")[0] not in FORMS:
-        raise ConfigError(f"--from: got {given.source}; wanted npz:PATH, hdf5:PATH or minari:ID")
+        raise UserError(f"--from: got {given.source}; wanted npz:PATH, hdf5:PATH or minari:ID")
     suite = open_suite(suite_settings(given.suite, (given.task,)))
     recorded = demonstrations(given.task, given.source, suite, MOST)
     store = open_store()

@@ -7,7 +7,8 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from services.cli.arguments import ConfigError, exit_code
+from dmil_core.errors import UserError
+from services.cli.arguments import exit_code
 from services.cli.progress import console
 
 KINDS = {
@@ -25,7 +26,7 @@ def run(arguments: Sequence[str]) -> None:
     """Run the program that draws what the first argument names.
 
     Raises:
-        ConfigError: if it names nothing that can be drawn.
+        UserError: if it names nothing that can be drawn.
     """
     if arguments and arguments[0] in {"--help", "-h"}:
         console.print("usage: python -m services.report KIND [--help]\n")
@@ -34,7 +35,7 @@ def run(arguments: Sequence[str]) -> None:
         return
     if not arguments or arguments[0] not in KINDS:
         got = arguments[0] if arguments else "nothing"
-        raise ConfigError(f"report: got {got}; wanted one of {', '.join(KINDS)}, each with a --help of its own")
+        raise UserError(f"report: got {got}; wanted one of {', '.join(KINDS)}, each with a --help of its own")
     import_module(KINDS[arguments[0]]).run(arguments[1:])
 
 

@@ -14,8 +14,8 @@ from typing import Annotated
 import tyro
 from pydantic import ValidationError
 
-from dmil_core.errors import RunError, explain
-from services.cli.arguments import ConfigError, Quiet, exit_code, parse
+from dmil_core.errors import RunError, UserError, explain
+from services.cli.arguments import Quiet, exit_code, parse
 from services.cli.progress import Clock, console
 from services.cli.yaml_files import read_yaml
 from services.demonstrations.store import open_store
@@ -101,7 +101,7 @@ def _description() -> str:
     for file in sorted(CONFIGS.glob("*.yaml")):
         try:
             lines.append(f"  {file.stem:16}{_read(file).what}")
-        except ConfigError as error:
+        except UserError as error:
             lines.append(f"  {file.stem:16}cannot be read: {error}")
     return (__doc__ or "") + "\n".join(["\nSweeps in tune_configs:", "", *lines])
 
@@ -110,22 +110,22 @@ def _read(file: Path) -> Sweep:
     try:
         return Sweep.model_validate(read_yaml(file, "SWEEP"))
     except ValidationError as error:
-        raise ConfigError("\n".join(f"{file}: {line}" for line in explain(error).splitlines())) from error
+        raise UserError("\n".join(f"{file}: {line}" for line in explain(error).splitlines())) from error
 
 
 def _begun(given: Arguments) -> SweepFolder:
     """Make the folder of a new sweep."""
     known = [file.stem for file in sorted(CONFIGS.glob("*.yaml"))]
     if given.sweep is None:
-        raise ConfigError(f"SWEEP: got none; wanted a file as tune_configs/em.yaml, or one of {', '.join(known)}")
+        raise UserError(f"SWEEP: got none; wanted a file as tune_configs/em.yaml, or one of {', '.join(known)}")
     file = CONFIGS / f"{given.sweep}.yaml" if given.sweep in known else Path(given.sweep)
     try:
         sweep = _read(file).at(given.scale, given.suites or (), given.seeds or ())
     except ValidationError as error:
-        raise ConfigError("\n".join(f"--{line}" for line in explain(error).splitlines())) from error
+        raise UserError("\n".join(f"--{line}" for line in explain(error).splitlines())) from error
     for value, flag in ((sweep.suites, "--suites"), (sweep.seeds, "--seeds")):
         if len(set(value)) < len(value):
-            raise ConfigError(f"{flag}: got {' '.join(map(str, value))}; wanted each once")
+            raise UserError(f"{flag}: got {' '.join(map(str, value))}; wanted each once")
     for trial in planned(sweep, given.scale):
         open_suite(trial.config.suite)
     name = given.name or f"{file.stem}-{given.scale}-{datetime.now():%Y%m%d-%H%M%S}"
@@ -145,7 +145,7 @@ def _begun(given: Arguments) -> SweepFolder:
 def _resumed(given: Arguments) -> SweepFolder:
     """Open the folder of a sweep that was begun."""
     if given.sweep or given.suites or given.seeds or given.name:
-        raise ConfigError(
+        raise UserError(
             "--resume: got SWEEP, --suites, --seeds or --name with it; wanted none: a sweep goes on with its own"
         )
     assert given.resume is not None

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from rich.table import Table
 
-from dmil_core.errors import RunError, WorkError
+from dmil_core.errors import RunError, UserError, WorkError
 from dmil_core.statistics import success_rate
-from services.cli.arguments import ConfigError, Quiet, exit_code, parse
+from services.cli.arguments import Quiet, exit_code, parse
 from services.cli.composition import suite_settings
 from services.cli.progress import Bar, console
 from services.experiments.experiment import RunnerKind, open_runner
@@ -49,9 +49,9 @@ def run(arguments: Sequence[str]) -> None:
     tasks = given.tasks or getattr(suite, "expert_tasks", (*suite.train_tasks, *suite.test_tasks))
     tasks = [task for task in dict.fromkeys(tasks) if suite.expert(task) is not None]
     if not tasks:
-        raise ConfigError(f"--tasks: got none that has a scripted expert in {suite.name}; wanted at least one")
+        raise UserError(f"--tasks: got none that has a scripted expert in {suite.name}; wanted at least one")
     if given.seeds < 1 or given.first_seed < 0:
-        raise ConfigError(
+        raise UserError(
             f"--seeds, --first-seed: got {given.seeds} from {given.first_seed} on; wanted at least one, none below 0"
         )
     seeds = range(given.first_seed, given.first_seed + given.seeds)

@@ -13,7 +13,6 @@ from pydantic import ValidationError
 
 from dmil_core.errors import RunError, UserError, explain
 from services.cli.progress import console_logging
-from services.cli.yaml_files import ConfigError
 
 T = TypeVar("T")
 Quiet = Annotated[
@@ -52,13 +51,13 @@ def parse(program: type[T], description: str, arguments: Sequence[str], defaults
         defaults: the value of every argument that is not given.
 
     Raises:
-        ConfigError: for a value that a setting does not allow; what is no flag at all ends with exit code 2.
+        UserError: for a value that a setting does not allow; what is no flag at all ends with exit code 2.
     """
     module = program.__module__ if program.__module__ != "__main__" else f"services.{Path(sys.argv[0]).stem}"
     try:
         return tyro.cli(program, prog=f"python -m {module}", args=arguments, description=description, default=defaults)
     except ValidationError as error:
-        raise ConfigError(explain(error)) from error
+        raise UserError(explain(error)) from error
 
 
 def exit_code(program: Callable[[Sequence[str]], None], arguments: Sequence[str]) -> int:

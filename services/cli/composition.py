@@ -15,10 +15,10 @@ from dmil_core.configs import (
     SuiteConfig,
     preset_of,
 )
-from dmil_core.errors import explain, shown
+from dmil_core.errors import UserError, explain, shown
 from dmil_core.methods.registry import MethodError
 from services.cli.arguments import peek
-from services.cli.yaml_files import ConfigError, merged, read_yaml
+from services.cli.yaml_files import merged, read_yaml
 
 DEFAULT_SUITE, DEFAULT_PRESET = "ml10", "quick"
 
@@ -27,7 +27,7 @@ def defaults_from(arguments: Sequence[str]) -> ExperimentConfig:
     """Return what ``--preset``, ``--suite``, ``--method``, ``--config`` and ``--demos`` say all other settings are.
 
     Raises:
-        ConfigError: as `config_from`.
+        UserError: as `config_from`.
     """
     early = peek(arguments, preset=str, suite=str, method=str, config=Path, demos=str)
     config = config_from(early.preset or DEFAULT_PRESET, early.config, early.suite, early.method)
@@ -49,11 +49,11 @@ def config_from(
         method: in place of the file's, or of DMIL.
 
     Raises:
-        ConfigError: names the key, what it got and what is allowed.
+        UserError: names the key, what it got and what is allowed.
     """
     named, _, size = preset.rpartition("-")
     if size not in SIZES or (named and preset not in PRESETS):
-        raise ConfigError(
+        raise UserError(
             f"--preset: got {preset!r}; wanted {', '.join(SIZES)}, with --suite, or one of {', '.join(PRESETS)}"
         )
     given = {} if file is None else read_yaml(file, "--config")
@@ -62,7 +62,7 @@ def config_from(
     except ValidationError as error:
         raise _no_name(suite) from error
     except MethodError as error:
-        raise ConfigError(str(error) if file is None or method is not None else f"{file}: {error}") from error
+        raise UserError(str(error) if file is None or method is not None else f"{file}: {error}") from error
     settings = merged(settings, given, str(file))
     if method is not None:
         settings["method"]["name"] = method
@@ -79,25 +79,25 @@ def suite_settings(suite: str, tasks: Sequence[str] | None = None) -> SuiteConfi
     """Return the settings of a suite, with `tasks` in place of those of both splits if they are given.
 
     Raises:
-        ConfigError: for what cannot be the name of a suite, or no task at all.
+        UserError: for what cannot be the name of a suite, or no task at all.
     """
     if tasks is not None and not tasks:
-        raise ConfigError("--tasks: got none; wanted at least one; leave it out for all")
+        raise UserError("--tasks: got none; wanted at least one; leave it out for all")
     try:
         return SuiteConfig.model_validate({"name": suite, "train_tasks": tasks, "test_tasks": tasks})
     except ValidationError as error:
         raise _no_name(suite) from error
 
 
-def _no_name(suite: str | None) -> ConfigError:
-    return ConfigError(f"--suite: got {shown(suite)}; wanted a name of letters, digits and hyphens, as ml10")
+def _no_name(suite: str | None) -> UserError:
+    return UserError(f"--suite: got {shown(suite)}; wanted a name of letters, digits and hyphens, as ml10")
 
 
 def with_evaluation(config: ExperimentConfig, evaluation: EvaluationConfig) -> ExperimentConfig:
     """Return `config` with another evaluation.
 
     Raises:
-        ConfigError: if the two do not go together.
+        UserError: if the two do not go together.
     """
     return checked({**config.model_dump(), "evaluation": evaluation.model_dump()})
 
@@ -106,9 +106,9 @@ def checked(settings: dict[str, Any], origin: str = "") -> ExperimentConfig:
     """Return the experiment of these settings.
 
     Raises:
-        ConfigError: names the settings that are wrong, each behind `origin`.
+        UserError: names the settings that are wrong, each behind `origin`.
     """
     try:
         return ExperimentConfig.model_validate(settings)
     except ValidationError as error:
-        raise ConfigError("\n".join(f"{origin}{line}" for line in explain(error).splitlines())) from error
+        raise UserError("\n".join(f"{origin}{line}" for line in explain(error).splitlines())) from error

@@ -16,10 +16,6 @@ MOST_CHARACTERS = 500
 """Of what PyYAML says."""
 
 
-class ConfigError(UserError):
-    """A setting that is unknown or has an impossible value."""
-
-
 def merged(settings: Mapping[str, Any], given: Mapping[Any, Any], origin: str, prefix: str = "") -> dict[str, Any]:
     """Return `settings`, by section, with those that are given in their place.
 
@@ -30,16 +26,16 @@ def merged(settings: Mapping[str, Any], given: Mapping[Any, Any], origin: str, p
         prefix: of the section's name.
 
     Raises:
-        ConfigError: for one that there is not.
+        UserError: for one that there is not.
     """
     found = dict(settings)
     for key, value in given.items():
         if key not in found:
             named = key if isinstance(key, str) and len(key) < 50 else shown(key)
-            raise ConfigError(f"{origin}: got the unknown key {prefix}{named}; wanted one of {', '.join(found)}")
+            raise UserError(f"{origin}: got the unknown key {prefix}{named}; wanted one of {', '.join(found)}")
         if isinstance(found[key], dict):
             if not isinstance(value, dict):
-                raise ConfigError(f"{origin}: {prefix}{key}: got {shown(value)}; wanted keys: {', '.join(found[key])}")
+                raise UserError(f"{origin}: {prefix}{key}: got {shown(value)}; wanted keys: {', '.join(found[key])}")
             value = merged(found[key], value, origin, f"{prefix}{key}.")
         found[key] = value
     return found
@@ -49,7 +45,7 @@ def read_yaml(file: Path, flag: str) -> dict[Any, Any]:
     """Return the keys and values of a file.
 
     Raises:
-        ConfigError: names `flag` and the file that is none, or is too large, nested or damaged to be read.
+        UserError: names `flag` and the file that is none, or is too large, nested or damaged to be read.
     """
     try:
         loader = _PlainLoader(read_file(file, MOST_BYTES).decode())
@@ -59,9 +55,9 @@ def read_yaml(file: Path, flag: str) -> dict[Any, Any]:
             loader.dispose()
     # Besides its own errors, PyYAML lets through what comes of dates, numbers and tags that are none.
     except (OSError, yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError) as error:
-        raise ConfigError(f"{flag}: got {file}, {_cut(str(error))}; wanted a readable YAML file") from error
+        raise UserError(f"{flag}: got {file}, {_cut(str(error))}; wanted a readable YAML file") from error
     if not isinstance(given, dict):
-        raise ConfigError(f"{flag}: got {file} with {type(given).__name__} in it; wanted keys with values")
+        raise UserError(f"{flag}: got {file} with {type(given).__name__} in it; wanted keys with values")
     return given
 
 

@@ -207,7 +207,7 @@ def open_store() -> DemoStore:
     """Return the store under the data root, with the storage that ``DMIL_STORAGE`` names behind it.
 
     Raises:
-        StorageError: if it names none.
+        UserError: if it names none.
     """
     return DemoStore(data_root(), given_storage())
 

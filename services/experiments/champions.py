@@ -30,14 +30,6 @@ if TYPE_CHECKING:
 ALIAS = "champion"
 
 
-class PromotionError(UserError):
-    """A checkpoint that cannot be compared with the champion."""
-
-
-class RegistryError(RunError):
-    """An MLflow that does not answer, or has no registry."""
-
-
 @contextmanager
 def _asking(uri: str) -> Iterator[None]:
     try:
@@ -45,7 +37,7 @@ def _asking(uri: str) -> Iterator[None]:
     except (UserError, RunError):
         raise
     except Exception as error:  # noqa: BLE001  MLflow and what is below it raise many kinds
-        raise RegistryError(
+        raise RunError(
             f"--promote: MLflow at {redacted(uri)} does not answer as one with a registry of models: "
             f"{in_words(error)}; wanted the MLflow that the run was tracked by; set MLFLOW_TRACKING_URI to it"
         ) from None  # its text may hold secrets
@@ -60,8 +52,8 @@ def open_contest(checkpoint: Checkpoint, experiment: Experiment, folder: Path) -
         folder: for the champion's checkpoint and rows.
 
     Raises:
-        PromotionError: if MLflow has no model of the checkpoint, or the champion is of another protocol.
-        RegistryError: if MLflow does not answer, or has no registry.
+        UserError: if MLflow has no model of the checkpoint, or the champion is of another protocol.
+        RunError: if MLflow does not answer, or has no registry.
     """
     from mlflow import MlflowClient
 
@@ -77,7 +69,7 @@ def open_contest(checkpoint: Checkpoint, experiment: Experiment, folder: Path) -
         rival = Checkpoint(_downloaded(client, champion, uri, folder / "model"))
     theirs = open_suite(rival.manifest.config.suite).protocol
     if theirs != experiment.suite.protocol:
-        raise PromotionError(
+        raise UserError(
             f"--promote: got the protocol {experiment.suite.protocol!r}; wanted that of {name}'s champion, {theirs!r}; "
             f"take the alias {ALIAS} from it in MLflow, and the next model has it"
         )
@@ -96,7 +88,7 @@ def _model_of(client: "MlflowClient", checkpoint: Checkpoint) -> "LoggedModel":
         got = "which has no MLflow run"
     else:
         got = f"of which MLflow run {run_id} has no model, and {len(found)} of others"
-    raise PromotionError(
+    raise UserError(
         f"--checkpoint: got {checkpoint.path}, {got}; wanted the last checkpoint of a finished run of "
         "services.meta_train; what MLflow did not take while the run was on it takes by: "
         f"python -m services.tracking flush {home}"
@@ -155,7 +147,7 @@ class Contest:
             folder: of its rows.
 
         Raises:
-            RegistryError: if MLflow does not answer.
+            RunError: if MLflow does not answer.
         """
         name, champion = self.experiment.suite.name, self.champion
         with _asking(self.uri):

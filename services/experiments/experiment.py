@@ -47,19 +47,15 @@ COLLAPSED_ITERATIONS = 100
 """So long may one sub-skill take nearly all states before a warning."""
 
 
-class NoWorkersError(UserError):
-    """A number of workers that cannot do any work."""
-
-
 @contextmanager
 def open_runner(kind: RunnerKind, suite: TaskSuite, workers: int | None) -> Iterator[Runner]:
     """Open a runner and close it in the end, whatever happens.
 
     Raises:
-        NoWorkersError: if there is nobody to work.
+        UserError: if there is nobody to work.
     """
     if workers is not None and workers < 1:
-        raise NoWorkersError(f"--workers: got {workers}; wanted at least 1; leave it out for one for each CPU")
+        raise UserError(f"--workers: got {workers}; wanted at least 1; leave it out for one for each CPU")
     runner: Runner = LocalRunner(suite) if kind == "local" else RayRunner(suite, workers)
     try:
         yield runner

@@ -15,17 +15,13 @@ from services.evaluation.summary import Summary
 from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoint, Checkpoints
 from services.storage.files import read_file
-from services.storage.run_folders import FolderError, find_folder
+from services.storage.run_folders import find_folder
 from services.tracking.history import Origin, read_metrics, read_origin
 
 MARK, BEGUN, CHECKPOINTS = "summary.json", "config.json", "checkpoints"
 """What the folder of a finished run is known by, what that of any run, and what no evaluation's has."""
 MOST_BYTES = 2**24
 """In it."""
-
-
-class UnfinishedError(UserError):
-    """A run that has not come to its end, or of which there is not all that is to be shown."""
 
 
 @dataclass(frozen=True)
@@ -37,21 +33,20 @@ class FinishedRun(EvaluationFolder):
         """Return a run by its name in `runs`, or by its folder.
 
         Raises:
-            FolderError: if there is no folder of a run.
-            UnfinishedError: if the run has not come to its end, or the folder is only that of an evaluation.
+            UserError: if there is no folder of a run, it has not come to its end, or it is only an evaluation's.
         """
         try:
             folder = find_folder(name, runs, MARK, "RUN")
-        except FolderError as error:
+        except UserError as error:
             for begun in (Path(name), runs / name):
                 if (begun / BEGUN).is_file():
-                    raise UnfinishedError(
+                    raise UserError(
                         f"RUN: got {begun}, which has not come to its end; wanted a finished run, with a {MARK}; go on "
                         f"with it: python -m services.meta_train --resume {begun}"
                     ) from error
             raise
         if not (folder / CHECKPOINTS).is_dir():
-            raise UnfinishedError(
+            raise UserError(
                 f"RUN: got {folder}, which has no {CHECKPOINTS}, as the folder of an evaluation; wanted that of a run "
                 "of services.meta_train"
             )
@@ -67,13 +62,13 @@ class FinishedRun(EvaluationFolder):
         """Success rates, with all that belongs to them.
 
         Raises:
-            UnfinishedError: if the file is not as a run writes it.
+            UserError: if the file is not as a run writes it.
         """
         path = self.folder / MARK
         try:
             return Summary.model_validate_json(read_file(path, MOST_BYTES))
         except ValidationError as error:
-            raise UnfinishedError(
+            raise UserError(
                 f"{path}: got {'; '.join(explain(error).splitlines())}; wanted what a run writes at its end; "
                 f"write it again: python -m services.meta_train --resume {self.folder}"
             ) from error

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dmil_core.configs import EvaluationConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError
-from dmil_core.errors import explain
+from dmil_core.errors import UserError, explain
 from dmil_core.statistics import Rate, success_rate
 from services.cli.composition import with_evaluation
 from services.cli.progress import Bar, console
@@ -19,7 +19,7 @@ from services.distributed.runner import Runner
 from services.evaluation.evaluator import Evaluator
 from services.evaluation.results import EpisodeResult, ImitationResult, read_rows, write_rows
 from services.experiments.experiment import Experiment
-from services.experiments.finished_run import FinishedRun, UnfinishedError
+from services.experiments.finished_run import FinishedRun
 from services.reporting.drawing import Picture, colour_of, drawn, panels
 from services.reporting.lineup import MOST_TASKS, MismatchError, policy_after
 from services.reporting.page import DataTable, Part, Prose, Section
@@ -189,7 +189,7 @@ def _plan_of(run: FinishedRun) -> CurvePlan | None:
     """Return what was measured of the run's newest checkpoint, if anything was.
 
     Raises:
-        UnfinishedError: if the file is not as `measure` writes it.
+        UserError: if the file is not as `measure` writes it.
     """
     path = run.folder / FOLDER / PLAN
     if not path.exists():
@@ -197,7 +197,7 @@ def _plan_of(run: FinishedRun) -> CurvePlan | None:
     try:
         plan = CurvePlan.model_validate_json(read_file(path, MOST_BYTES))
     except ValidationError as error:
-        raise UnfinishedError(
+        raise UserError(
             f"{path}: got {'; '.join(explain(error).splitlines())}; wanted what measuring adaptation writes; remove it "
             "and measure again"
         ) from error

@@ -13,7 +13,8 @@ from jaxtyping import UInt8
 from matplotlib import pyplot
 
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
-from services.cli.arguments import ConfigError, exit_code, parse
+from dmil_core.errors import UserError
+from services.cli.arguments import exit_code, parse
 from services.cli.progress import Bar, console
 from services.rollouts.episodes import demonstrate
 from services.storage.files import room_for
@@ -54,7 +55,7 @@ def run(arguments: Sequence[str]) -> None:
         suite = open_suite(SuiteConfig(name=name))
         camera: str | View | None = getattr(suite, "camera", None)
         if camera is None:
-            raise ConfigError(f"--suites: got {name}, which names no camera; wanted suites whose tasks can be drawn")
+            raise UserError(f"--suites: got {name}, which names no camera; wanted suites whose tasks can be drawn")
         path = given.output / f"{name}.jpg"
         draw_gallery(suite, camera, given.seed, path, COLUMNS.get(name.partition("-")[0], 5))
         console.print(str(path))

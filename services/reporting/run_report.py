@@ -9,7 +9,8 @@ from pathlib import Path
 
 import tyro
 
-from services.cli.arguments import ConfigError, parse
+from dmil_core.errors import UserError
+from services.cli.arguments import parse
 from services.cli.progress import Bar, console
 from services.experiments.experiment import RunnerKind, open_runner
 from services.experiments.finished_run import FinishedRun
@@ -115,7 +116,7 @@ def run(arguments: Sequence[str]) -> None:
     finished = FinishedRun.found(given.run, given.runs)
     path = given.output or finished.folder / "report" / PAGE
     if path.is_dir():
-        raise ConfigError(f"--output: got {path}, a folder; wanted a file, as {path / PAGE}")
+        raise UserError(f"--output: got {path}, a folder; wanted a file, as {path / PAGE}")
     path.parent.mkdir(parents=True, exist_ok=True)
     if given.adaptation:
         with open_runner(given.runner, finished.experiment.suite, given.workers) as runner:

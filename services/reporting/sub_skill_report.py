@@ -13,7 +13,8 @@ from pathlib import Path
 import torch
 import tyro
 
-from services.cli.arguments import ConfigError, exit_code, parse
+from dmil_core.errors import UserError
+from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.experiments.finished_run import FinishedRun
 from services.reporting.embedding import PERPLEXITY, SEED, embedding_section
@@ -72,31 +73,30 @@ def _check(given: Arguments) -> None:
     """Refuse numbers that nothing can be made of.
 
     Raises:
-        ConfigError: names the flag.
+        UserError: names the flag.
     """
     least = {"shots": 1, "rollouts": 0, "embedding_shots": 1, "perplexity": 1, "seed": 0}
     for name, bound in least.items():
         if not (got := getattr(given, name)) >= bound:
-            raise ConfigError(f"--{name.replace('_', '-')}: got {got}; wanted at least {bound}")
+            raise UserError(f"--{name.replace('_', '-')}: got {got}; wanted at least {bound}")
 
 
 def _found(which: Sequence[str], runs: Path) -> dict[str, FinishedRun]:
     """Return the runs by their labels.
 
     Raises:
-        ConfigError: for none at all, or two of one label.
-        FolderError: if there is no such run.
+        UserError: for none at all, two of one label, or one that there is not.
     """
     found: dict[str, FinishedRun] = {}
     for named in which:
         label, _, name = named.rpartition("=")
         own = FinishedRun(find_folder(name, runs, MARK, "RUN"))
         if (label := label or own.name) in found:
-            raise ConfigError(f"RUN: got {label} twice; wanted each once, or labels to tell them apart: LABEL=RUN")
+            raise UserError(f"RUN: got {label} twice; wanted each once, or labels to tell them apart: LABEL=RUN")
         found[label] = own
     if not any(map(has_sub_skills, found.values())):
         got = ", ".join(f"{label} of {own.config.method.name}" for label, own in found.items()) or "none"
-        raise ConfigError(f"RUN: got {got}; wanted at least one of a method with several sub-skills, as dmil")
+        raise UserError(f"RUN: got {got}; wanted at least one of a method with several sub-skills, as dmil")
     return found
 
 

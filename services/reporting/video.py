@@ -13,7 +13,7 @@ import tyro
 
 from dmil_core.errors import UserError, shown
 from dmil_core.settings import sub_skills_of
-from services.cli.arguments import ConfigError, exit_code, parse
+from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.evaluation.results import EpisodeResult
 from services.experiments.finished_run import FinishedRun
@@ -55,7 +55,7 @@ def run(arguments: Sequence[str]) -> None:
     row = _row_of(finished, given)
     path = given.output or finished.folder / "report" / "videos" / f"{name_of(row)}.{given.format}"
     if path.suffix != f".{given.format}":
-        raise ConfigError(f"--output: got {path}; wanted a name that ends in .{given.format}, or another --format")
+        raise UserError(f"--output: got {path}; wanted a name that ends in .{given.format}, or another --format")
     with replaying(finished) as replay:
         sides, seen = _sides(replay, row, FORMS[given.format], demonstration=given.demonstration)
     if seen.difference is not None:
@@ -69,23 +69,23 @@ def _row_of(finished: FinishedRun, given: Arguments) -> EpisodeResult:
     """Return the row of the episode that is asked for.
 
     Raises:
-        ConfigError: if the run has none, with those that it has.
+        UserError: if the run has none, with those that it has.
     """
     rows = finished.episodes
     tasks = dict.fromkeys(row.task for row in rows)
     if given.task not in tasks:
-        raise ConfigError(f"--task: got {shown(given.task)}; wanted one of {finished.name}'s: {', '.join(tasks)}")
+        raise UserError(f"--task: got {shown(given.task)}; wanted one of {finished.name}'s: {', '.join(tasks)}")
     rows = [row for row in rows if row.task == given.task]
     shots = sorted({row.shots for row in rows})
     if given.shots not in shots:
-        raise ConfigError(
+        raise UserError(
             f"--shots: got {given.shots}; {finished.name} was evaluated with {', '.join(map(str, shots))}; wanted one "
             "of these, or a run with others: --evaluation.shots"
         )
     by_number = {row.episode: row for row in rows if row.shots == given.shots}
     number = min(by_number) if given.episode is None else given.episode
     if number not in by_number:
-        raise ConfigError(f"--episode: got {number}; wanted one from {min(by_number)} to {max(by_number)}")
+        raise UserError(f"--episode: got {number}; wanted one from {min(by_number)} to {max(by_number)}")
     return by_number[number]
 
 

@@ -19,14 +19,6 @@ PACKAGES = {"s3": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": 
 KINDS = "file:///folder, s3://bucket/folder, gs://bucket/folder"
 
 
-class StorageError(UserError):
-    """A URL that names no storage."""
-
-
-class TroubleError(RunError):
-    """A storage that cannot be reached, or does not give what it should."""
-
-
 class Storage:
     """Folders and files under one URL, by names with slashes."""
 
@@ -34,16 +26,16 @@ class Storage:
         """Name a storage; nothing is asked of it yet.
 
         Raises:
-            StorageError: if the URL names none.
+            UserError: if the URL names none.
         """
         self.url = url
         try:
             self._files, root = fsspec.core.url_to_fs(url, use_listings_cache=False)
         except ImportError as error:
             package = PACKAGES.get(url.partition(":")[0], "the package that it names")
-            raise StorageError(f"{STORAGE}: got {url}, which needs {package}: pip install {package}") from error
+            raise UserError(f"{STORAGE}: got {url}, which needs {package}: pip install {package}") from error
         except ValueError as error:
-            raise StorageError(f"{STORAGE}: got {url} ({error}); wanted a URL as {KINDS}") from error
+            raise UserError(f"{STORAGE}: got {url} ({error}); wanted a URL as {KINDS}") from error
         self._root = root.rstrip("/")
 
     def put(self, name: str, content: bytes) -> None:
@@ -56,12 +48,12 @@ class Storage:
         """Return a file's content, or None if it is not there.
 
         Raises:
-            TroubleError: for one of over `most` bytes.
+            RunError: for one of over `most` bytes.
         """
         try:
             size = self._files.size(self._path(name))
             if size > most:
-                raise TroubleError(f"{self.url}/{name}: got {size} bytes; wanted at most {most}; remove it")
+                raise RunError(f"{self.url}/{name}: got {size} bytes; wanted at most {most}; remove it")
             return self._files.cat_file(self._path(name))
         except FileNotFoundError:
             return None
@@ -82,7 +74,7 @@ class Storage:
             seal: the name of the file that vouches for them.
 
         Raises:
-            TroubleError: for a file that is too large, or missing although the seal is there.
+            RunError: for a file that is too large, or missing although the seal is there.
         """
         content = self.get(f"{name}/{seal}", 2**20)
         if content is None:
@@ -92,7 +84,7 @@ class Storage:
             for file, most in files.items():
                 part = self.get(f"{name}/{file}", most)
                 if part is None:
-                    raise TroubleError(f"{self.url}/{name}/{file}: got nothing; wanted what its {seal} vouches for")
+                    raise RunError(f"{self.url}/{name}/{file}: got nothing; wanted what its {seal} vouches for")
                 (beside / file).parent.mkdir(parents=True, exist_ok=True)
                 (beside / file).write_bytes(part)
             (beside / seal).write_bytes(content)
@@ -126,7 +118,7 @@ def given_storage() -> Storage | None:
     """Return the storage that ``DMIL_STORAGE`` names, if it does.
 
     Raises:
-        StorageError: if it names none.
+        UserError: if it names none.
     """
     url = os.environ.get(STORAGE)
     return Storage(url) if url else None

@@ -71,7 +71,7 @@ class Replica:
         Of checkpoints the newest is fetched, if it is newer than all in the folder; then the records too.
 
         Raises:
-            TroubleError: if the copy cannot be used.
+            RunError: if the copy cannot be used.
         """
         place = f"{self._name}/checkpoints"
         here = [path.name for path in self._folder.glob("checkpoints/iteration-*")]
@@ -101,8 +101,8 @@ def restored(folder: Path) -> bool:
     """Fetch a run that the storage has further than its folder; return whether it did.
 
     Raises:
-        StorageError: if ``DMIL_STORAGE`` names none.
-        TroubleError: if the copy cannot be used.
+        UserError: if ``DMIL_STORAGE`` names none.
+        RunError: if the copy cannot be used.
     """
     storage = given_storage()
     return storage is not None and Replica(folder, storage).restore()
@@ -121,7 +121,7 @@ def replicated(folder: Path, place: str = "runs", *, restore: bool = False) -> I
         restore: fetch beforehand what the storage has further.
 
     Raises:
-        StorageError: if the URL names no storage.
+        UserError: if the URL names no storage.
     """
     storage = given_storage()
     if storage is None:

@@ -6,10 +6,6 @@ from dmil_core.errors import UserError, shown
 from services.storage.files import inside
 
 
-class FolderError(UserError):
-    """A name that no folder can have or has."""
-
-
 def new_folder(name: str, runs: Path, mark: str) -> Path:
     """Return the folder of a new run or sweep; it is not made yet.
 
@@ -19,13 +15,13 @@ def new_folder(name: str, runs: Path, mark: str) -> Path:
         mark: the file by which the folder of one that was begun is known.
 
     Raises:
-        FolderError: if the name is none, or taken.
+        UserError: if the name is none, or taken.
     """
     if name in (".", "..") or Path(name).name != name:
-        raise FolderError(f"--name: got {shown(name)}; wanted the name of a folder in {runs}, without any /")
+        raise UserError(f"--name: got {shown(name)}; wanted the name of a folder in {runs}, without any /")
     folder = _held(runs / name, runs, "--name")
     if (folder / mark).exists():
-        raise FolderError(f"--name: got {folder}, which is taken; wanted a new name, or --resume {folder}")
+        raise UserError(f"--name: got {folder}, which is taken; wanted a new name, or --resume {folder}")
     return folder
 
 
@@ -39,23 +35,23 @@ def find_folder(name: str, runs: Path, mark: str, flag: str = "--resume") -> Pat
         flag: that `name` was given by.
 
     Raises:
-        FolderError: if there is none.
+        UserError: if there is none.
     """
     for folder in (Path(name), runs / name):
         if (folder / mark).is_file():
             return _held(folder, runs, flag)
-    raise FolderError(f"{flag}: got {shown(name)}; wanted a folder with a {mark} in it, or the name of one in {runs}")
+    raise UserError(f"{flag}: got {shown(name)}; wanted a folder with a {mark} in it, or the name of one in {runs}")
 
 
 def _held(folder: Path, runs: Path, flag: str) -> Path:
     """Return a folder, unless it seems to lie in `runs` and is a link that leads elsewhere.
 
     Raises:
-        FolderError: then, because whatever is written would be written there.
+        UserError: then, because whatever is written would be written there.
     """
     if folder.parent.absolute() == runs.absolute():
         try:
             inside(runs, folder.name)
         except OSError as error:
-            raise FolderError(f"{flag}: got {folder}, a link out of {runs}; wanted a folder in it") from error
+            raise UserError(f"{flag}: got {folder}, a link out of {runs}; wanted a folder in it") from error
     return folder

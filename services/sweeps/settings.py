@@ -10,9 +10,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from dmil_core.configs import EvaluationConfig, ExperimentConfig, SuiteConfig, SuiteName, preset_of
+from dmil_core.errors import UserError
 from dmil_core.seeding import stream
 from dmil_core.settings import Count, NotNegative, Seed, Settings
-from services.cli.arguments import ConfigError
 from services.cli.composition import checked, method_named
 from services.cli.yaml_files import merged
 from services.evaluation.results import Metric
@@ -197,8 +197,7 @@ def planned(sweep: Sweep, size: Size) -> list[PlannedTrial]:
         size: of the preset.
 
     Raises:
-        ConfigError: for settings that there are not; names where they come from.
-        UserError: for a suite that there is not.
+        UserError: for a suite or for settings that there are not; names where these come from.
     """
     variants = sweep.search.variants() if sweep.search else sweep.variants
     evaluation: Overrides = {"shots": list(sweep.shots)} | ({} if size == "smoke" else {"episodes": sweep.episodes})
@@ -221,12 +220,12 @@ def planned(sweep: Sweep, size: Size) -> list[PlannedTrial]:
             PlannedTrial(name=name, variant=variant, suite=suite, seed=seed, config=config, evaluations=evaluations)
         )
     if len({trial.name for trial in trials}) < len(trials):
-        raise ConfigError(f"variants: got {', '.join(variants)}; wanted names that differ in letters or digits")
+        raise UserError(f"variants: got {', '.join(variants)}; wanted names that differ in letters or digits")
     if sweep.search:
         for suite in {trial.config.suite for trial in trials}:
             _only_training_tasks(suite)
         if any(trial.config.evaluation.every is None for trial in trials):
-            raise ConfigError("settings.evaluation.every: got none; wanted iterations between what a search goes by")
+            raise UserError("settings.evaluation.every: got none; wanted iterations between what a search goes by")
     return trials
 
 
@@ -234,14 +233,14 @@ def _only_training_tasks(suite: SuiteConfig) -> None:
     """Refuse a search that would choose by tasks of meta-testing.
 
     Raises:
-        ConfigError: names them.
+        UserError: names them.
     """
     whole = open_suite(suite.model_copy(update={"train_tasks": None, "test_tasks": None}))
     held_out = suite.test_tasks or whole.test_tasks
     if wrong := set(held_out) - set(whole.train_tasks):
-        raise ConfigError(
+        raise UserError(
             f"settings.suite.test_tasks: got {', '.join(sorted(wrong))}; wanted some of {suite.name}'s own "
             "meta-training tasks, held out: a search must not look at meta-testing tasks"
         )
     if both := set(held_out) & set(suite.train_tasks or whole.train_tasks):
-        raise ConfigError(f"settings.suite.train_tasks: got {', '.join(sorted(both))}; wanted those not in test_tasks")
+        raise UserError(f"settings.suite.train_tasks: got {', '.join(sorted(both))}; wanted those not in test_tasks")

@@ -71,8 +71,7 @@ class Tracker:
             parent: the folder of the sweep that this run is a trial of.
 
         Raises:
-            SpoolError: if a record of the run so far is damaged.
-            IdentityError: if the file that says which MLflow run it is, is.
+            UserError: if a record of the run so far is damaged, or the file that says which MLflow run it is, is.
             DiskFullError: for want of space.
         """
         uri = tracking_uri()

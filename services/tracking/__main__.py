@@ -15,7 +15,7 @@ from tyro.conf import Positional
 from dmil_core.errors import RunError, UserError
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
-from services.storage.run_folders import FolderError, find_folder
+from services.storage.run_folders import find_folder
 from services.tracking import in_words, redacted, tracking_uri
 from services.tracking.delivery import Delivery
 from services.tracking.spool import Artifact, Spool
@@ -40,7 +40,7 @@ def run(arguments: Sequence[str]) -> None:
     """Run the program.
 
     Raises:
-        FolderError: if there is no such run.
+        UserError: if there is no such run.
         RunError: if MLflow does not take the records, or another process is delivering them.
     """
     given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, tyro.MISSING))
@@ -76,7 +76,7 @@ def _flush(delivery: Delivery, folder: Path, uri: str) -> None:
 def _report(folder: Path, uri: str) -> None:
     """Record the folder with the report of a run that is over once more, and deliver it."""
     if not (folder / REPORT).is_dir():
-        raise FolderError(
+        raise UserError(
             f"RUN: got {folder}, which has no folder {REPORT}; wanted a finished run: python -m services.report run"
         )
     delivery = Delivery(folder, uri)

@@ -36,18 +36,6 @@ IDENTITY = "mlflow_run.json"
 IDENTITY_BYTES = 10_000
 
 
-class IdentityError(UserError):
-    """A damaged ``mlflow_run.json``, or one that does not go with the records beside it."""
-
-
-class BusyError(RunError):
-    """Another process delivers the records of this run."""
-
-
-class ParentError(RunError):
-    """A trial whose sweep MLflow does not know yet."""
-
-
 class Identity(BaseModel):
     """Which MLflow run a folder belongs to and how far delivery got, ``mlflow_run.json``."""
 
@@ -72,14 +60,14 @@ class Identity(BaseModel):
         """Read the identity of a run.
 
         Raises:
-            IdentityError: if there is none, or it is damaged.
+            UserError: if there is none, or it is damaged.
         """
         path = folder / IDENTITY
         try:
             return Identity.model_validate_json(read_file(path, IDENTITY_BYTES))
         except (OSError, ValidationError) as error:
             got = error.strerror if isinstance(error, OSError) else "; ".join(_problems(error))
-            raise IdentityError(
+            raise UserError(
                 f"{path}: got {got}; wanted what a tracked run writes there: the id of its MLflow run; put it back, or "
                 "delete it, and the next --resume gives the run's records to a new MLflow run"
             ) from error
@@ -94,7 +82,7 @@ class Identity(BaseModel):
             parent: the tag of the run that this one is a trial of.
 
         Raises:
-            IdentityError: if it is damaged.
+            UserError: if it is damaged.
         """
         path = folder / IDENTITY
         if not path.exists():
@@ -116,8 +104,7 @@ class Delivery:
             uri: of MLflow.
 
         Raises:
-            IdentityError: if the identity is missing or damaged.
-            SpoolError: if a record is.
+            UserError: if the identity is missing or damaged, or a record is.
         """
         self._folder, self._uri = folder, uri
         self._lock = FileLock(folder / "tracking.lock", thread_local=False)
@@ -153,7 +140,7 @@ class Delivery:
         """Return the records that MLflow has not taken yet.
 
         Raises:
-            SpoolError: if one is damaged.
+            UserError: if one is damaged.
         """
         return list(read_spool(self._folder / "tracking.jsonl", line=self.delivered, offset=self._offset))
 
@@ -172,8 +159,8 @@ class Delivery:
         MLflow keeps one of equal metrics, parameters, tags and inputs.
 
         Raises:
-            BusyError: if another process is at it.
-            SpoolError: if a record is damaged.
+            RunError: if another process is at it.
+            UserError: if a record is damaged.
             MlflowException: or whatever else MLflow and what is below it raise, if it does not take a record.
         """
         self._take_over()
@@ -202,7 +189,7 @@ class Delivery:
         try:
             self._lock.acquire(blocking=False)
         except Timeout as error:
-            raise BusyError(
+            raise RunError(
                 f"{self._folder}: another process, the run itself or a flush, delivers its records; wait for its end"
             ) from error
         self._identity = Identity.of(self._folder)
@@ -212,7 +199,7 @@ class Delivery:
         path, count = self._folder / "tracking.jsonl", self.delivered
         ends = [line.end for line in islice(read_spool(path), count)]
         if len(ends) < count:
-            raise IdentityError(
+            raise UserError(
                 f"{self._folder / 'mlflow_run.json'}: got {count} records delivered; wanted at most the {len(ends)} of "
                 f"{path}: restore the two together"
             )
@@ -250,7 +237,7 @@ class Delivery:
         if identity.parent is not None:
             parent = self._tagged(client, experiment_id, identity.parent)
             if parent is None:
-                raise ParentError(
+                raise RunError(
                     f"{self._folder}: MLflow has not the run yet that this one is a trial of; flush that one first"
                 )
             tags[PARENT_TAG] = parent

@@ -19,7 +19,7 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
     """Return the metrics of each iteration of a run; an iteration done again counts once.
 
     Raises:
-        SpoolError: names the line that is damaged.
+        UserError: names the line that is damaged.
     """
     by_step: dict[int, dict[str, float]] = {}
     for line in read_spool(folder / "tracking.jsonl"):
@@ -32,7 +32,7 @@ def read_origin(folder: Path) -> Origin:
     """Return what a run was made of; one that was not tracked says nothing of it.
 
     Raises:
-        SpoolError: names the line that is damaged.
+        UserError: names the line that is damaged.
     """
     commits, data_sets = [], {}
     for line in read_spool(folder / "tracking.jsonl"):

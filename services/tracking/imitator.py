@@ -49,7 +49,7 @@ class Imitator(PythonModel):
             params: ``fine_tuning_steps`` and ``learning_rate``; those of the run's evaluation if not given.
 
         Raises:
-            PackingError: for a row that is not such.
+            UserError: for a row that is not such.
             RunError: where adaptation has diverged.
         """
         given = params or {}

@@ -10,10 +10,6 @@ from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.errors import UserError, shown
 
 
-class PackingError(UserError):
-    """An input of the model that is no support set with an observation."""
-
-
 class Question(NamedTuple):
     """What the model is asked: what to do after having seen a support set."""
 
@@ -42,14 +38,14 @@ def unpacked(given: Mapping[str, Any], obs_dim: int, action_dim: int) -> Questio
         action_dim: numbers in an action.
 
     Raises:
-        PackingError: names the part that is wrong, what it got and what was wanted.
+        UserError: names the part that is wrong, what it got and what was wanted.
     """
     support = given.get("support")
     if not isinstance(support, Sequence | np.ndarray) or isinstance(support, str) or len(support) == 0:
-        raise PackingError(f"support: got {shown(support)}; wanted a list of at least one demonstration")
+        raise UserError(f"support: got {shown(support)}; wanted a list of at least one demonstration")
     observation = _numbers(given.get("observation"), "observation", (obs_dim,))
     if not np.isfinite(observation).all():
-        raise PackingError("observation: got numbers that are not finite; wanted real numbers only")
+        raise UserError("observation: got numbers that are not finite; wanted real numbers only")
     memory = given.get("memory")
     return Question(
         tuple(_demonstration(one, number, obs_dim, action_dim) for number, one in enumerate(support)),
@@ -62,24 +58,24 @@ def _memory(given: Any) -> Int64[np.ndarray, " memory_dim"]:
     try:
         return np.asarray(given, np.int64)
     except (TypeError, ValueError) as error:
-        raise PackingError(f"memory: got {shown(given)}; wanted whole numbers, as the step before returned") from error
+        raise UserError(f"memory: got {shown(given)}; wanted whole numbers, as the step before returned") from error
 
 
 def _demonstration(given: Any, number: int, obs_dim: int, action_dim: int) -> Demonstration:
     name = f"support[{number}]"
     if not isinstance(given, Mapping) or not {"observations", "actions"} <= given.keys():
         got = ", ".join(map(str, given)) if isinstance(given, Mapping) else type(given).__name__
-        raise PackingError(f"{name}: got {got or 'nothing'}; wanted a demonstration's observations and actions")
+        raise UserError(f"{name}: got {got or 'nothing'}; wanted a demonstration's observations and actions")
     observations = _numbers(given["observations"], f"{name}.observations", (-1, obs_dim))
     actions = _numbers(given["actions"], f"{name}.actions", (-1, action_dim))
     if len(observations) != len(actions):
-        raise PackingError(
+        raise UserError(
             f"{name}: got {len(observations)} observations for {len(actions)} actions; wanted one action for each"
         )
     try:
         return Demonstration(str(number), "support", observations, actions)
     except DemonstrationError as error:
-        raise PackingError(f"{name}: {error}") from error
+        raise UserError(f"{name}: {error}") from error
 
 
 def _numbers(given: Any, name: str, wanted: tuple[int, ...]) -> np.ndarray:
@@ -89,7 +85,7 @@ def _numbers(given: Any, name: str, wanted: tuple[int, ...]) -> np.ndarray:
         rows = [np.asarray(row, np.float32) for row in given] if len(wanted) == 2 else given
         found = np.asarray(rows, np.float32)
     except (TypeError, ValueError) as error:
-        raise PackingError(f"{name}: got {shown(given)}; wanted {in_words}") from error
+        raise UserError(f"{name}: got {shown(given)}; wanted {in_words}") from error
     if found.ndim != len(wanted) or found.shape[-1] != wanted[-1]:
-        raise PackingError(f"{name}: got the shape {found.shape}; wanted {in_words}")
+        raise UserError(f"{name}: got the shape {found.shape}; wanted {in_words}")
     return found

@@ -16,10 +16,6 @@ from services.storage.files import room_for
 LONGEST_LINE = 2**22
 
 
-class SpoolError(UserError):
-    """A damaged line among the records of a run."""
-
-
 class _Content(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -99,12 +95,12 @@ def read_spool(path: Path, *, line: int = 0, offset: int = 0) -> Iterator[Line]:
         offset: bytes to leave out.
 
     Raises:
-        SpoolError: names the file and the line that is damaged.
+        UserError: names the file and the line that is damaged.
     """
     if not path.exists():
         return
     if not path.is_file():
-        raise SpoolError(f"{path}: got no regular file; wanted a file of records; remove it")
+        raise UserError(f"{path}: got no regular file; wanted a file of records; remove it")
     with path.open("rb") as file:
         file.seek(offset)
         for number, text in enumerate(iter(lambda: file.readline(LONGEST_LINE), b""), line + 1):
@@ -114,7 +110,7 @@ def read_spool(path: Path, *, line: int = 0, offset: int = 0) -> Iterator[Line]:
             try:
                 kind, value = _RECORD.validate_json(text)
             except ValidationError as error:
-                raise SpoolError(
+                raise UserError(
                     f"{path}, line {number}: got {text[:60]!r}; wanted a record, as of tags or metrics, in JSON; put "
                     '["tags", {}] in its place to go on without it'
                 ) from error
@@ -128,7 +124,7 @@ class Spool:
         """Open a file of records, and cut off a last line that a killed process did not finish.
 
         Raises:
-            SpoolError: names the file and the line that is damaged.
+            UserError: names the file and the line that is damaged.
         """
         self.path = path
         self.measured: defaultdict[str, dict[int, float]] = defaultdict(dict)

@@ -13,8 +13,8 @@ import psutil
 import pytest
 from mlflow import MlflowClient
 
+from dmil_core.errors import UserError
 from services import meta_train
-from services.cli.arguments import ConfigError
 from services.evaluation.results import EpisodeResult
 from services.storage.checkpoints import Checkpoint, Checkpoints
 from services.tracking.models import models_of
@@ -152,7 +152,7 @@ def test_a_run_that_was_stopped_before_its_first_checkpoint_begins_anew(workplac
 )
 def test_going_on_with_other_settings_is_refused(train, flag: tuple[str, str], section: str):
     train("run", "--training.iterations", "0")
-    with pytest.raises(ConfigError, match=f"--resume: got other settings of {section} than the run began with"):
+    with pytest.raises(UserError, match=f"--resume: got other settings of {section} than the run began with"):
         train("run", *flag, resume=True)
 
 

@@ -12,7 +12,8 @@ import pytest
 
 import services
 from dmil_core.configs import PRESETS
-from services.cli.arguments import PROGRAMS, ConfigError, parse
+from dmil_core.errors import UserError
+from services.cli.arguments import PROGRAMS, parse
 from services.cli.composition import config_from
 from services.meta_train import Arguments, run
 
@@ -120,7 +121,7 @@ def test_a_wrong_file_is_answered_with_what_is_allowed(complaint, yaml_file, tex
 
 @pytest.mark.parametrize("file", ["nowhere.yaml", "."])
 def test_a_file_that_cannot_be_read_is_named(file: str):
-    with pytest.raises(ConfigError, match=r"--config: got .*; wanted a readable YAML file"):
+    with pytest.raises(UserError, match=r"--config: got .*; wanted a readable YAML file"):
         config_from("ml10-smoke", Path(file))
 
 

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 from mlflow import MlflowClient
 
+from dmil_core.errors import RunError
 from services import evaluate, meta_train
 from services.demonstrations.store import DemoStore
 from services.evaluation.comparison import Difference
-from services.experiments.champions import RegistryError, is_better
+from services.experiments.champions import is_better
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.delivery import IDENTITY
 from tests.services.conftest import Server
@@ -98,11 +99,11 @@ def test_what_cannot_be_promoted_is_told_before_the_evaluation(
     checkpoint = ["--checkpoint", str(runs["worse"])]
     uri = os.environ["MLFLOW_TRACKING_URI"]
     monkeypatch.setenv("MLFLOW_REGISTRY_URI", "nowhere://models")
-    with pytest.raises(RegistryError, match=r"does not answer as one with a registry of models: .*nowhere"):
+    with pytest.raises(RunError, match=r"does not answer as one with a registry of models: .*nowhere"):
         evaluate.run([*checkpoint, *arguments])
     monkeypatch.delenv("MLFLOW_REGISTRY_URI")
     monkeypatch.setenv("MLFLOW_TRACKING_URI", uri.rpartition(":")[0] + ":1")
-    with pytest.raises(RegistryError, match=r"MLflow at http://127\.0\.0\.1:1 does not answer"):
+    with pytest.raises(RunError, match=r"MLflow at http://127\.0\.0\.1:1 does not answer"):
         evaluate.run([*checkpoint, *arguments])
     assert not (tmp_path / "none" / "episodes.jsonl").exists()
 

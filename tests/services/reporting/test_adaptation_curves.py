@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from dmil_core.errors import UserError
 from services.distributed.runner import LocalRunner
 from services.evaluation.results import EpisodeResult, ImitationResult, read_rows
 from services.experiments.experiment import open_runner
-from services.experiments.finished_run import FinishedRun, UnfinishedError
+from services.experiments.finished_run import FinishedRun
 from services.reporting.adaptation_curves import adaptation_section, measure, points
 from services.reporting.lineup import MismatchError, policy_after
 from services.reporting.page import DataTable, Prose, write_page
@@ -144,7 +145,7 @@ def test_a_damaged_plan_is_told(trained: Trained):
     measure(run, counting(run), shots=(1,), steps=(0,), episodes=1)
     plan = run.folder / "adaptation" / "plan.json"
     plan.write_text(json.dumps({**json.loads(plan.read_text()), "steps": "many"}))
-    with pytest.raises(UnfinishedError, match=re.escape(f"{plan}: got ") + ".*remove it and measure again"):
+    with pytest.raises(UserError, match=re.escape(f"{plan}: got ") + ".*remove it and measure again"):
         adaptation_section(run)
 
 

@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 
 from dmil_core.configs import PRESETS
+from dmil_core.errors import RunError, UserError
 from services import meta_train
 from services.demonstrations.store import DemoStore, open_store
 from services.experiments.experiment import Experiment, open_runner
 from services.storage.checkpoints import FILES, SEAL, Checkpoint, CheckpointError, Checkpoints
-from services.storage.remote import STORAGE, Storage, StorageError, TroubleError
+from services.storage.remote import STORAGE, Storage
 from services.storage.replication import Replica, replicated
 
 S3 = {"AWS_ACCESS_KEY_ID": "any", "AWS_SECRET_ACCESS_KEY": "any", "AWS_DEFAULT_REGION": "us-east-1"}
@@ -67,9 +68,9 @@ def test_a_sealed_folder_is_whole_or_not_there(url: str, tmp_path: Path):
     assert storage.sealed("a", "seal", "c") == {}
     assert storage.get_sealed("a/b", tmp_path / "here", {"one": 1, "deep/two": 2}, "seal")
     assert (tmp_path / "here" / "deep" / "two").read_bytes() == b"22"
-    with pytest.raises(TroubleError, match="got 2 bytes; wanted at most 1"):
+    with pytest.raises(RunError, match="got 2 bytes; wanted at most 1"):
         storage.get_sealed("a/b", tmp_path / "other", {"deep/two": 1}, "seal")
-    with pytest.raises(TroubleError, match="three: got nothing"):
+    with pytest.raises(RunError, match="three: got nothing"):
         storage.get_sealed("a/b", tmp_path / "other", {"three": 1}, "seal")
     assert {path.name for path in tmp_path.iterdir()} <= {"here", "storage"}
     storage.put("a/c/one", b"unsealed")
@@ -192,6 +193,6 @@ def test_a_storage_that_is_away_is_told_once_and_stops_nothing(workplace: Path, 
 )
 def test_a_url_that_names_no_storage_is_a_mistake(url: str, told: str, monkeypatch, workplace: Path, complaint):
     monkeypatch.setenv(STORAGE, url)
-    with pytest.raises(StorageError), replicated(workplace / "run"):
+    with pytest.raises(UserError), replicated(workplace / "run"):
         pass
     assert told in complaint(meta_train.run, "--preset", "ml10-smoke", "--runner", "local")

@@ -8,7 +8,7 @@ import yaml
 from pydantic import ValidationError
 
 from dmil_core.configs import EvaluationConfig, preset_of
-from services.cli.yaml_files import ConfigError
+from dmil_core.errors import UserError
 from services.sweeps.folders import evaluated, trained
 from services.sweeps.settings import Range, Sweep, planned
 from services.tune_sweep import CONFIGS
@@ -120,7 +120,7 @@ def test_a_size_has_its_own_budget() -> None:
     ],
 )
 def test_a_setting_that_there_is_not_is_named_with_its_place(changes: dict, told: str) -> None:
-    with pytest.raises((ConfigError, ValidationError), match=told):
+    with pytest.raises((UserError, ValidationError), match=told):
         planned(small(**changes).at("quick"), "quick")
 
 
@@ -182,6 +182,6 @@ def test_a_range_is_kept(log: bool) -> None:
     ],
 )
 def test_a_search_must_not_look_at_meta_testing_tasks(suite: dict, told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
+    with pytest.raises(UserError, match=told):
         planned(search(**suite).at("quick"), "quick")
     assert planned(search(train_tasks=["push"], test_tasks=["reach"]).at("quick"), "quick")

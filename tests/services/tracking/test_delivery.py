@@ -10,7 +10,7 @@ from mlflow import MlflowClient
 
 from dmil_core.errors import UserError
 from services.tracking import Tracker
-from services.tracking.delivery import RUN_TAG, Delivery, Identity, IdentityError
+from services.tracking.delivery import RUN_TAG, Delivery, Identity
 from tests.services.tracking.conftest import steps
 
 PROJECT = Path(__file__).parents[3]
@@ -84,7 +84,7 @@ def test_who_takes_over_begins_where_the_other_ended(tmp_path: Path, mlflow_file
 @pytest.mark.parametrize("content", ["", "no JSON", "{}", '{"run_id": "x", "delivered": 1}'])
 def test_a_damaged_identity_is_named(tmp_path: Path, content: str):
     (tmp_path / "mlflow_run.json").write_text(content)
-    with pytest.raises(IdentityError, match=r"mlflow_run\.json: got .*delete it") as caught:
+    with pytest.raises(UserError, match=r"mlflow_run\.json: got .*delete it") as caught:
         Tracker(tmp_path, "an experiment")
     assert isinstance(caught.value, UserError)
 
@@ -93,7 +93,7 @@ def test_more_delivered_than_there_is_is_refused(tmp_path: Path):
     identity = Identity.found_or_made(tmp_path, "an experiment").model_copy(update={"delivered": 2})
     (tmp_path / "mlflow_run.json").write_text(identity.model_dump_json())
     (tmp_path / "tracking.jsonl").write_text('["tags", {}]\n')
-    with pytest.raises(IdentityError, match="got 2 records delivered; wanted at most the 1 of"):
+    with pytest.raises(UserError, match="got 2 records delivered; wanted at most the 1 of"):
         Delivery(tmp_path, "sqlite://")
 
 

@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
+from dmil_core.errors import UserError
 from services.tracking.history import Origin, read_metrics, read_origin
-from services.tracking.spool import SpoolError
 
 
 def spool(folder: Path, *records: tuple[str, object]) -> None:
@@ -38,7 +38,7 @@ def test_a_damaged_record_is_refused_by_file_and_line(tmp_path: Path, line: str)
     spool(tmp_path, metrics(1, agreement=0.5))
     with (tmp_path / "tracking.jsonl").open("a") as file:
         file.write(line)
-    with pytest.raises(SpoolError) as error:
+    with pytest.raises(UserError) as error:
         read_metrics(tmp_path)
     assert f"{tmp_path / 'tracking.jsonl'}, line 2: " in str(error.value)
 

@@ -14,7 +14,7 @@ from mlflow.artifacts import download_artifacts
 from mlflow.pyfunc.model import PythonModelContext
 
 from dmil_core.configs import preset_of
-from dmil_core.errors import RunError
+from dmil_core.errors import RunError, UserError
 from dmil_core.methods.base import FineTuning
 from dmil_core.methods.registry import OURS, method_type
 from services import tracking
@@ -26,7 +26,7 @@ from services.tracking import Tracker
 from services.tracking.delivery import Identity
 from services.tracking.imitator import POLICIES_KEPT, Imitator
 from services.tracking.models import checkpoint_in, models_of
-from services.tracking.packing import PackingError, packed
+from services.tracking.packing import packed
 from tests.services.tracking import old_imitator
 
 GUIDE = Path(__file__).parents[3] / "docs" / "mlflow.md"
@@ -122,7 +122,7 @@ def test_mlflow_loads_it_without_pickle_and_predicts(untrained, own_mlflow: str,
     told: dict[str, Any] = {}
     exec(snippet, told)
     assert (len(told["action"]), told["memory"]) == (4, [])
-    with pytest.raises(PackingError, match=r"observation: got the shape \(2,\); wanted 39 numbers"):
+    with pytest.raises(UserError, match=r"observation: got the shape \(2,\); wanted 39 numbers"):
         loaded.predict(packed(support, observation[:2]))
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from dmil_core.demonstrations import Demonstration
-from services.tracking.packing import PackingError, packed, unpacked
+from dmil_core.errors import UserError
+from services.tracking.packing import packed, unpacked
 
 DRAW = np.random.default_rng(0)
 ONE, OTHER = (
@@ -54,6 +55,6 @@ def test_what_is_packed_comes_back_through_json_to_the_bit():
     ],
 )
 def test_a_mistake_is_told_with_its_place(changes: dict[str, Any], told: str):
-    with pytest.raises(PackingError) as caught:
+    with pytest.raises(UserError) as caught:
         unpacked(packed([ONE], ONE.observations[0]) | changes, 3, 2)
     assert told in str(caught.value)

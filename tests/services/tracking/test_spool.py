@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 
+from dmil_core.errors import UserError
 from services.storage.files import DiskFullError
 from services.tracking import Tracker
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.delivery import Identity
-from services.tracking.spool import Spool, SpoolError, read_spool
+from services.tracking.spool import Spool, read_spool
 from tests.services.tracking.conftest import records
 
 
@@ -19,14 +20,14 @@ def test_a_damaged_record_is_named_by_file_and_line(tmp_path: Path, line: str, c
     (tmp_path / "tracking.jsonl").write_text(f'["tags", {{}}]\n{line}\n["tags", {{}}]\n')
     printed = complaint(tracking_program, "flush", str(tmp_path))
     assert f"{tmp_path / 'tracking.jsonl'}, line 2: got " in printed
-    with pytest.raises(SpoolError, match=r"tracking\.jsonl, line 2"):
+    with pytest.raises(UserError, match=r"tracking\.jsonl, line 2"):
         Tracker(tmp_path, "an experiment")
 
 
 @pytest.mark.parametrize("path", ["/etc/passwd", "../other", "report/../../other"])
 def test_only_what_is_the_run_s_is_ever_sent(tmp_path: Path, path: str):
     (tmp_path / "tracking.jsonl").write_text(json.dumps(["artifact", {"path": path, "folder": None}]) + "\n")
-    with pytest.raises(SpoolError, match="line 1"):
+    with pytest.raises(UserError, match="line 1"):
         list(read_spool(tmp_path / "tracking.jsonl"))
 
 
