@@ -133,7 +133,7 @@ def measured_costs(plan: Plan, rounds: int) -> Costs:
         pool.result(first)
 
         def many() -> None:
-            pool.result([pool.submit("add", small, beside=first) for _ in range(CALLS)][-1])
+            pool.result([pool.submit("add", small, same_worker_as=first) for _ in range(CALLS)][-1])
 
         def one_by_one() -> None:
             for _ in range(CALLS):

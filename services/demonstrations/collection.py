@@ -125,7 +125,7 @@ class DemonstrationCollection:
         at = ""
 
         def figures() -> Figures:
-            return Figures(workers=runner.staff, at=at)
+            return Figures(workers=runner.worker_counts, at=at)
 
         with Bar("collecting", len(tasks) * settings.per_task, 0, "demonstrations", figures) as bar:
             while attempts:

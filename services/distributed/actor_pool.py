@@ -1,6 +1,7 @@
-"""Keeps a pool of actors busy and alive; knows nothing of their work."""
+"""A pool of actors that replaces those that die or hang; it knows nothing of their work."""
 
 import bisect
+import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
@@ -8,376 +9,362 @@ from typing import Any
 import ray
 from ray.exceptions import ObjectLostError, RayActorError, RayError, RayTaskError
 
-from dmil_core.errors import RunError
-from services.distributed.calls import Call, Worker, now
-from services.distributed.errors import DeadlyCallError, LostError, NoRoomError
-from services.distributed.pool_events import Witness
-from services.distributed.stragglers import SLOWNESS, Patience
+from dmil_core.errors import RunError, UserError
+from services.distributed.calls import Call, PoolListener, Worker, referenced
+from services.distributed.errors import DeadlyCallError, LostError
+from services.distributed.stragglers import TIMEOUT_FACTOR, Timeouts
 
-PLACEMENT_SECONDS = 120
-DEATHS_ALLOWED = 3
-"""A call in whose course so many actors ended is suspected to end them."""
-WATCH_SECONDS = 0.5
+PLACEMENT_TIMEOUT_SECONDS = 120
+MAX_DEATHS = 3
+"""After so many deaths of workers during one call, the call is suspected to cause them."""
+POLL_SECONDS = 0.5
+
+logger = logging.getLogger(__name__)
 
 
 class Pool:
-    """Stateless actors of one kind. A call whose actor dies is made again, on whichever actor has room.
+    """Stateless actors of one kind; a call whose actor dies is sent again, to whichever has room.
 
-    Calls are sent in the order in which they are submitted, and may build upon the results of others that are still
-    under way: those go from actor to actor, and whoever submits need not wait. If a call is lost, all that build upon
-    it fail with it, and are made again too. A call that takes far longer than its like is also given to a spare actor:
-    the first answer counts, for they are equal, and whoever was slower is ended.
+    Calls are sent in the order of their submission, and may depend on the results of others that are still in flight:
+    those travel from actor to actor, and the caller need not wait. If a call is lost, all that depend on it fail with
+    it, and are sent again too. A call that takes far longer than others of its method is also sent to a backup: the
+    first answer counts, for both are equal, and the slower actor is killed.
     """
 
     def __init__(
         self,
-        make: Callable[[], Any],
+        start_actor: Callable[[], Any],
         size: int,
-        ahead: int = 1,
-        say: Callable[[str], None] = lambda words: None,
-        witness: Witness | None = None,
-        enough: int | None = None,
+        max_in_flight: int = 1,
+        listener: PoolListener | None = None,
+        min_size: int | None = None,
     ) -> None:
-        """Start `size` actors and wait until `enough` are up; the others join whenever there is room for them.
+        """Start `size` actors and wait until `min_size` are healthy; the others join when the cluster has room.
 
-        An actor that waits for room is what makes a cluster grow, if it does so by itself.
+        An actor that waits for room is what makes an autoscaling cluster grow.
 
         Args:
-            make: starts one.
-            size: how many.
-            ahead: calls that an actor may hold at a time. With 2 it has its next one at hand when it ends one.
-            say: is told of actors lost, slow and replaced, in words.
-            witness: is told so too, to count them.
-            enough: how many have room now; all by default.
+            start_actor: returns a new actor.
+            size: number of actors.
+            max_in_flight: calls sent to an actor at a time. With 2 its next one is at hand when it ends one.
+            listener: receives the events of the pool.
+            min_size: actors that have room now, all by default.
 
         Raises:
-            NoRoomError: if the cluster cannot place that many.
+            UserError: if the cluster cannot place that many.
         """
-        self._make, self._ahead, self._say, self._witness = make, ahead, say, witness or Witness()
+        self._start_actor, self._max_in_flight, self._listener = start_actor, max_in_flight, listener or PoolListener()
         self._workers: list[Worker] = []
         self._starting: dict[ray.ObjectRef, Worker] = {}
-        self._waiting: list[Call] = []
+        self._queued: list[Call] = []
         self._running: dict[ray.ObjectRef, Call] = {}
-        self._patience = Patience()
+        self._timeouts = Timeouts()
         self._submitted = self._failed_starts = 0
-        self._manned = time.monotonic()
-        """When an actor was last seen to be up."""
-        self.restarts = 0
-        """How many actors died or were ended for slowness, and replaced."""
+        self._healthy_at = time.monotonic()
+        """When a worker was last seen to be healthy."""
         self.grow(size)
-        until = time.monotonic() + PLACEMENT_SECONDS
-        while len(self) < (size if enough is None else min(enough, size)):
-            self._settle([])
-            if time.monotonic() > until:
+        deadline = time.monotonic() + PLACEMENT_TIMEOUT_SECONDS
+        while len(self) < (size if min_size is None else min(min_size, size)):
+            self._wait([])
+            if time.monotonic() > deadline:
                 self.close()
                 raise _no_room(size)
 
     def __len__(self) -> int:
-        """How many actors are up."""
-        return sum(worker.up for worker in self._workers)
+        """Return the number of healthy workers."""
+        return sum(worker.healthy for worker in self._workers)
 
     def grow(self, size: int) -> None:
-        """Start actors until there are `size`, without waiting for them; they get calls as soon as they are up."""
+        """Start workers until there are `size`, without waiting for them; each receives calls once it is healthy."""
         for number in range(len(self._workers), size):
-            self._workers.append(self._start(number))
+            self._workers.append(self._start_worker(number))
 
     def submit(
         self,
         method: str,
         *arguments: Any,
         returns: int = 1,
-        beside: Call | None = None,
-        on: Any | None = None,
+        same_worker_as: Call | None = None,
+        actor: Any | None = None,
         label: str = "",
     ) -> Call:
-        """Have a method called, as soon as there is an actor for it.
+        """Queue a call of a method, to be sent as soon as a worker has room.
 
         Args:
             method: of the actors.
             arguments: values, object references, calls or lists of calls, see `Call`.
-            returns: how many results it has. The first is fetched, the others stay object references.
-            beside: the call on whose actor it is to run, however busy that is; by default the least busy one.
-            on: an actor that is not the pool's, and is not replaced if it dies.
-            label: what it is, in messages.
+            returns: number of results. The first is fetched, the others stay object references.
+            same_worker_as: call whose worker is to run it, however busy that is; by default the least busy one does.
+            actor: one outside the pool to run it, which is not replaced if it dies.
+            label: its name in messages.
         """
-        call = Call(self._submitted, method, arguments, returns, beside, on, label or method)
+        call = Call(self._submitted, method, arguments, returns, same_worker_as, actor, label or method)
         self._submitted += 1
         self._queue(call)
-        self._send_waiting()
+        self._send_queued()
         return call
 
     def result(self, call: Call) -> Any:
         """Wait until a call is done, and return its first result.
 
         Raises:
-            DeadlyCallError: if three actors end one after the other in the course of some call.
-            LostError: if an actor of one's own is gone, or a result that a call is built upon.
-            NoRoomError: if no actor is left, and none can be placed.
+            DeadlyCallError: if three workers die one after the other during one call.
+            LostError: if an actor outside the pool is gone, or a result that a call depends on.
+            UserError: if no worker is left, and none can be placed.
             Exception: whatever the call raised.
         """
         while not call.done:
-            # Those that wait want to be sent as soon as any call ends; else only this one matters.
-            self._settle(self._running if self._waiting else [*call.references[:1], *call.twin[:1]])
+            # Queued calls are sent when any call ends; without them, only this call matters.
+            self._wait(self._running if self._queued else [*call.references[:1], *call.backup_references[:1]])
         if call.error is not None:
             raise call.error
         return call.value
 
     def results(self, calls: Sequence[Call]) -> Iterator[tuple[int, Any]]:
-        """Yield each call's index and first result as they come.
+        """Yield each call's index and first result as they arrive.
 
         Raises:
             DeadlyCallError: as `result`, and the others.
         """
-        left = dict(enumerate(calls))
-        while left:
-            for index in [index for index, call in left.items() if call.done]:
-                yield index, self.result(left.pop(index))
-            if left:
-                self._settle(self._running)
+        pending = dict(enumerate(calls))
+        while pending:
+            for index in [index for index, call in pending.items() if call.done]:
+                yield index, self.result(pending.pop(index))
+            if pending:
+                self._wait(self._running)
 
-    def map(
-        self, method: str, calls: Iterable[tuple[Any, ...]], label: Callable[..., str] = lambda *arguments: ""
-    ) -> Iterator[tuple[int, Any]]:
-        """Call `method` once with each tuple of arguments; yield each call's index and result as they come.
-
-        Args:
-            method: of the actors.
-            calls: the arguments of each call.
-            label: says of its arguments what a call is, in messages.
-
-        Raises:
-            DeadlyCallError: as `result`, and the others.
-        """
-        yield from self.results([self.submit(method, *arguments, label=label(*arguments)) for arguments in calls])
-
-    def take_note(self) -> None:
-        """Take note of all that has ended by now, without waiting, and see to what goes on too long."""
+    def poll(self) -> None:
+        """Process what has ended by now, without waiting, and start backups of slow calls."""
         watched = [*self._running, *self._starting]
         if watched:
             ended, _ = ray.wait(watched, num_returns=len(watched), timeout=0, fetch_local=False)
             for reference in ended:
                 if reference in self._starting:
-                    self._is_up(reference)
-                elif reference in self._running:  # else a call's other attempt has ended before, in this very loop
-                    self._end(reference, self._running.pop(reference))
-        self._send_waiting()
-        self._watch()
+                    self._finish_start(reference)
+                elif reference in self._running:  # else the call's other attempt ended in this very loop
+                    self._finish(reference, self._running.pop(reference))
+        self._send_queued()
+        self._check_timeouts()
 
     def retry(self, call: Call) -> None:
-        """Have a call made again that was suspected to end its actors."""
-        self._witness.again(call)
+        """Queue a call again that was suspected to kill its workers."""
+        self._listener.call_resent(call)
         call.deaths = 0
         self._queue(call)
-        self._send_waiting()
+        self._send_queued()
 
-    def drop(self) -> None:
-        """Forget all calls; what is under way comes to its end unheeded."""
+    def discard_calls(self) -> None:
+        """Forget all calls; those in flight end with nobody waiting for them."""
         for call in set(self._running.values()):
-            self._let_spare_go(call)
-        self._waiting, self._running = [], {}
+            self._drop_backup(call)
+        self._queued, self._running = [], {}
         for worker in self._workers:
-            worker.calls = []
+            worker.in_flight = []
 
     def close(self) -> None:
         """Stop the actors."""
-        self.drop()
+        self.discard_calls()
         for worker in self._workers:
             ray.kill(worker.actor)
-            if worker.up:
-                self._witness.left()
+            if worker.healthy:
+                self._listener.worker_stopped()
         self._workers, self._starting = [], {}
 
-    # Actors
+    # Workers
 
-    def _start(self, number: int) -> Worker:
-        worker = Worker(number, self._make())
+    def _start_worker(self, number: int) -> Worker:
+        worker = Worker(number, self._start_actor())
         self._starting[worker.actor.__ray_ready__.remote()] = worker
         return worker
 
-    def _is_up(self, reference: ray.ObjectRef) -> None:
+    def _finish_start(self, reference: ray.ObjectRef) -> None:
         worker = self._starting.pop(reference)
         try:
             ray.get(reference)
         except RayActorError as error:
             self._failed_starts += 1
-            if self._failed_starts == DEATHS_ALLOWED:
-                raise RunError(f"workers: {DEATHS_ALLOWED} ended while they started; {_last_line(error)}") from error
+            if self._failed_starts == MAX_DEATHS:
+                raise RunError(f"workers: {MAX_DEATHS} ended while they started; {_last_line(error)}") from error
             if worker in self._workers:
-                self._workers[worker.number] = self._start(worker.number)
+                self._workers[worker.number] = self._start_worker(worker.number)
             for call in self._running.values():
-                if call.spare is worker:
-                    call.spare, call.began = None, None
+                if call.backup is worker:
+                    call.backup, call.started = None, None
         else:
-            self._failed_starts, worker.up = 0, True
+            self._failed_starts, worker.healthy = 0, True
             if worker in self._workers:
-                self._witness.joined()
+                self._listener.worker_started()
 
     def _replace(self, worker: Worker) -> None:
-        """End an actor that is dead, slow or out of reach; its calls are queued again, and another takes its place."""
+        """Kill a worker that is dead, slow or out of reach, put another in its place, and send its calls again."""
         ray.kill(worker.actor)
-        self.restarts += 1
-        if worker.up:
-            self._witness.lost()
-        heir = next((call.spare for call in worker.calls if call.spare is not None), None) or self._start(-1)
-        heir.number = worker.number
-        self._workers[worker.number] = heir
-        if heir.up:
-            self._witness.joined()
-        for call in worker.calls:
+        if worker.healthy:
+            self._listener.worker_lost()
+        backups = (call.backup for call in worker.in_flight if call.backup is not None)
+        replacement = next(backups, None) or self._start_worker(worker.number)
+        replacement.number = worker.number
+        self._workers[worker.number] = replacement
+        if replacement.healthy:
+            self._listener.worker_started()
+        for call in worker.in_flight:
             self._running.pop(call.references[0], None)
-            if call.twin:
-                call.worker, call.references, call.began = heir, call.twin, None
-                heir.calls.append(call)
+            if call.backup_references:
+                call.worker, call.references, call.started = replacement, call.backup_references, None
+                replacement.in_flight.append(call)
             else:
-                self._witness.again(call)
+                self._listener.call_resent(call)
                 self._queue(call)
-            call.spare, call.twin = None, []
-        worker.calls = []
+            call.backup, call.backup_references = None, []
+        worker.in_flight = []
 
     # Calls
 
     def _queue(self, call: Call) -> None:
-        call.worker, call.references, call.began = None, [], None
-        bisect.insort(self._waiting, call, key=lambda waiting: waiting.number)
+        call.worker, call.references, call.started = None, [], None
+        bisect.insort(self._queued, call, key=lambda queued: queued.number)
 
-    def _send_waiting(self) -> None:
-        for call in list(self._waiting):
-            if not all(part.references for part in call.built_upon):
+    def _send_queued(self) -> None:
+        for call in list(self._queued):
+            if not all(dependency.references for dependency in call.dependencies):
                 continue
-            if call.on is None:
-                call.worker = self._choose(call)
+            if call.actor is None:
+                call.worker = self._choose_worker(call)
                 if call.worker is None:
                     continue
-                call.worker.calls.append(call)
-            self._waiting.remove(call)
-            call.references = self._send(call, call.on if call.worker is None else call.worker.actor)
+                call.worker.in_flight.append(call)
+            self._queued.remove(call)
+            call.references = self._send(call, call.actor if call.worker is None else call.worker.actor)
 
-    def _choose(self, call: Call) -> Worker | None:
-        """Return the actor for a call, if one has room."""
-        if call.beside is not None and call.beside.worker in self._workers and call.beside.worker.up:
-            return call.beside.worker
-        worker = min((worker for worker in self._workers if worker.up), key=lambda one: one.load, default=None)
-        return worker if worker is not None and (worker.load < self._ahead or call.beside is not None) else None
+    def _choose_worker(self, call: Call) -> Worker | None:
+        """Return the worker for a call, if one has room."""
+        neighbour = call.same_worker_as
+        if neighbour is not None and neighbour.worker in self._workers and neighbour.worker.healthy:
+            return neighbour.worker
+        worker = min((worker for worker in self._workers if worker.healthy), key=lambda one: one.load, default=None)
+        has_room = worker is not None and (worker.load < self._max_in_flight or neighbour is not None)
+        return worker if has_room else None
 
     def _send(self, call: Call, actor: Any) -> list[ray.ObjectRef]:
-        made = getattr(actor, call.method).options(num_returns=call.returns).remote(*map(now, call.arguments))
-        references = [made] if call.returns == 1 else made
+        method = getattr(actor, call.method).options(num_returns=call.returns)
+        results = method.remote(*map(referenced, call.arguments))
+        references = [results] if call.returns == 1 else results
         self._running[references[0]] = call
         return references
 
-    def _settle(self, awaited: Iterable[ray.ObjectRef]) -> None:
-        """Wait until one of these has ended or an actor is up, or for a while, and take note of all that has."""
-        if references := [*awaited, *self._starting]:
-            ray.wait(references, fetch_local=False, timeout=WATCH_SECONDS)
-        self.take_note()
-        if any(worker.up for worker in self._workers):
-            self._manned = time.monotonic()
-        elif time.monotonic() - self._manned > PLACEMENT_SECONDS:
+    def _wait(self, references: Iterable[ray.ObjectRef]) -> None:
+        """Wait until one of these has ended, a worker has started, or a while has passed; then `poll`."""
+        if awaited := [*references, *self._starting]:
+            ray.wait(awaited, fetch_local=False, timeout=POLL_SECONDS)
+        self.poll()
+        if len(self):
+            self._healthy_at = time.monotonic()
+        elif time.monotonic() - self._healthy_at > PLACEMENT_TIMEOUT_SECONDS:
             raise _no_room(len(self._workers))
 
-    def _end(self, reference: ray.ObjectRef, call: Call) -> None:
-        of_twin = bool(call.twin) and reference == call.twin[0]
+    def _finish(self, reference: ray.ObjectRef, call: Call) -> None:
+        from_backup = reference in call.backup_references
         try:
             value = ray.get(reference)
         except RayError as error:
-            self._failed(call, error, of_twin=of_twin)
+            self._fail(call, error, from_backup=from_backup)
             return
-        if of_twin and call.worker is not None:
-            self._say(f"{call.label}: the other worker was first; worker {call.worker.number} is replaced")
+        if from_backup and call.worker is not None:
+            logger.warning(f"{call.label}: the backup was first; worker {call.worker.number} is replaced")
             self._replace(call.worker)
-        self._let_spare_go(call)
-        if call.began is not None:
-            self._patience.took(call, time.monotonic() - call.began)
-        self._take_from_worker(call)
+        self._drop_backup(call)
+        if call.started is not None:
+            self._timeouts.record(call, time.monotonic() - call.started)
+        self._remove_from_worker(call)
         call.value, call.done = value, True
-        call.arguments, call.beside = (), None  # what it was built upon may go
+        call.arguments, call.same_worker_as = (), None  # the results it depended on may be freed
 
-    def _failed(self, call: Call, error: RayError, *, of_twin: bool) -> None:
-        """See to a call that failed: by itself, with its actor, or with something that it is built upon."""
-        cause, actor = _root(error), call.spare if of_twin else call.worker
+    def _fail(self, call: Call, error: RayError, *, from_backup: bool) -> None:
+        """Process the failure of a call: its own, its actor's, or that of a dependency."""
+        cause, worker = _root_cause(error), call.backup if from_backup else call.worker
         if isinstance(cause, RayActorError):
-            if cause.actor_id in (None, _id(call.on if actor is None else actor.actor)):
-                self._actor_died(call, actor, cause)
-            elif of_twin:
-                self._let_spare_go(call)
-            else:  # what it is built upon is queued again as well
-                self._let_spare_go(call)
-                self._take_from_worker(call)
+            if cause.actor_id in (None, _id(call.actor if worker is None else worker.actor)):
+                self._handle_death(call, worker, cause)
+                return
+            self._drop_backup(call)
+            if not from_backup:  # the dependency is queued again as well
+                self._remove_from_worker(call)
                 self._queue(call)
             return
-        self._let_spare_go(call)
-        self._take_from_worker(call)
+        self._drop_backup(call)
+        self._remove_from_worker(call)
         if not isinstance(cause, ObjectLostError):
             cause.__cause__ = error  # the traceback of the other process
             call.error, call.done = cause, True
-        elif any(call.built_upon):
-            raise LostError(f"{call.label}: what it builds upon is lost with the node it was on") from error
+        elif any(call.dependencies):
+            raise LostError(f"{call.label}: a result that it depends on is lost with its node") from error
         else:
             self._queue(call)
 
-    def _take_from_worker(self, call: Call) -> None:
-        if call.worker is not None and call in call.worker.calls:
-            call.worker.calls.remove(call)
+    def _remove_from_worker(self, call: Call) -> None:
+        if call.worker is not None and call in call.worker.in_flight:
+            call.worker.in_flight.remove(call)
 
-    def _actor_died(self, call: Call, worker: Worker | None, error: RayActorError) -> None:
+    def _handle_death(self, call: Call, worker: Worker | None, error: RayActorError) -> None:
+        """Replace a worker that died during a call, and count the death against the call that it was running."""
         if worker is None:
-            raise LostError(f"{call.label}: the process that was to do it ended") from error
-        if worker is call.spare:
+            raise LostError(f"{call.label}: its actor died") from error
+        if worker is call.backup:
             suspect = call
-            self._let_spare_go(call)
+            self._drop_backup(call)
         else:
-            suspect = worker.calls[0]
-            self._say(f"worker {worker.number} ended in the course of {suspect.label}; its work is done again")
+            suspect = worker.in_flight[0]
+            logger.warning(f"worker {worker.number} ended in the course of {suspect.label}; its calls are sent again")
             self._replace(worker)
         suspect.deaths += 1
-        if suspect.deaths >= DEATHS_ALLOWED and suspect in self._waiting:
-            self._waiting.remove(suspect)
+        if suspect.deaths >= MAX_DEATHS and suspect in self._queued:
+            self._queued.remove(suspect)
             raise DeadlyCallError(suspect) from error
 
-    # Slowness
+    # Stragglers
 
-    def _watch(self) -> None:
-        """Start the clock of each call that is at work, and give those to a spare actor that take too long."""
+    def _check_timeouts(self) -> None:
+        """Note when each call starts to run, and send those to a backup that run too long."""
         now = time.monotonic()
-        own = [call for call in self._running.values() if call.on is not None]
-        first = [worker.calls[0] for worker in self._workers if worker.up and worker.calls]
-        for call in (*first, *own):
-            if call.began is None and all(part.done for part in call.built_upon):
-                call.began = now
-            elif call.began is not None and call.spare is None and now - call.began > self._patience.with_call(call):
-                self._rescue(call, now - call.began)
-            elif call.spare is not None and not call.twin and call.spare.up:
-                self._witness.again(call)
-                call.twin = self._send(call, call.spare.actor)
+        outside = [call for call in self._running.values() if call.actor is not None]
+        first = [worker.in_flight[0] for worker in self._workers if worker.healthy and worker.in_flight]
+        for call in (*first, *outside):
+            if call.started is None and all(dependency.done for dependency in call.dependencies):
+                call.started = now
+            elif call.started is not None and call.backup is None and now - call.started > self._timeouts.seconds(call):
+                self._time_out(call, now - call.started)
+            elif call.backup is not None and not call.backup_references and call.backup.healthy:
+                self._listener.call_resent(call)
+                call.backup_references = self._send(call, call.backup.actor)
 
-    def _rescue(self, call: Call, seconds: float) -> None:
-        if call.on is not None:
-            self._say(f"{call.label}: no answer for {seconds:.1f} s; its actor is ended")
-            ray.kill(call.on)
-            call.began = None
+    def _time_out(self, call: Call, seconds: float) -> None:
+        """Start a backup of a slow call; kill its actor where that is outside the pool."""
+        if call.actor is not None:
+            logger.warning(f"{call.label}: no answer for {seconds:.1f} s; its actor is ended")
+            ray.kill(call.actor)
+            call.started = None
             return
-        number = None if call.worker is None else call.worker.number
-        self._say(
-            f"worker {number} is slow: {call.label} has taken {seconds:.1f} s, over {SLOWNESS} times what "
-            "its like take; it is also given to another"
+        assert call.worker is not None
+        logger.warning(
+            f"worker {call.worker.number} is slow: {call.label} has taken {seconds:.1f} s, over {TIMEOUT_FACTOR} times "
+            "the median; a backup runs it too"
         )
-        call.spare = self._start(-1)
+        call.backup = self._start_worker(-1)
 
-    def _let_spare_go(self, call: Call) -> None:
-        if call.spare is not None:
-            ray.kill(call.spare.actor)
-            self._starting = {up: worker for up, worker in self._starting.items() if worker is not call.spare}
-            for reference in call.twin[:1]:
+    def _drop_backup(self, call: Call) -> None:
+        if call.backup is not None:
+            ray.kill(call.backup.actor)
+            self._starting = {start: worker for start, worker in self._starting.items() if worker is not call.backup}
+            for reference in call.backup_references[:1]:
                 self._running.pop(reference, None)
-            call.spare, call.twin, call.began = None, [], None
+            call.backup, call.backup_references, call.started = None, [], None
 
 
 def _id(actor: Any) -> str:
     return actor._actor_id.hex()
 
 
-def _root(error: BaseException) -> BaseException:
-    """Return what went wrong at first: each call built upon another adds a layer."""
+def _root_cause(error: BaseException) -> BaseException:
+    """Return the first failure: each call that depends on another adds a layer."""
     while isinstance(error, RayTaskError):
         error = error.cause
     return error
@@ -387,9 +374,9 @@ def _last_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()
 
 
-def _no_room(size: int) -> NoRoomError:
-    return NoRoomError(
-        f"workers: got {size}, not all placed after {PLACEMENT_SECONDS} s; the cluster has "
+def _no_room(size: int) -> UserError:
+    return UserError(
+        f"workers: got {size}, not all placed after {PLACEMENT_TIMEOUT_SECONDS} s; the cluster has "
         f"{ray.cluster_resources().get('CPU', 0):.0f} CPUs, {ray.available_resources().get('CPU', 0):.0f} "
         "free; ask for fewer or wait for other jobs to end"
     )

@@ -16,8 +16,24 @@ from services.distributed.timing import Span
 from services.suites.base import TaskSuite
 
 
+class Block(NamedTuple):
+    """Slots of an iteration whose gradients one worker computes and adds in one call."""
+
+    iteration: int
+    """Counts from 0."""
+    tasks: Sequence[str]
+    """The task of every slot of the iteration."""
+    groups: Sequence[Sequence[int]]
+    """Its slots, group by group."""
+
+    @property
+    def slots(self) -> list[int]:
+        """Its slots."""
+        return [slot for group in self.groups for slot in group]
+
+
 class BlockReport(NamedTuple):
-    """What is told of a block beside its gradient."""
+    """What a block yields beside its gradient."""
 
     metrics: list[Mapping[str, float]]
     """Of each of its slots."""
@@ -26,7 +42,7 @@ class BlockReport(NamedTuple):
 
 
 class AdaptationWorker:
-    """Computes blocks of slots and adds gradients; keeps nothing but what every call needs."""
+    """Computes gradients of blocks and adds them; holds nothing but what every call needs."""
 
     def __init__(
         self,
@@ -36,53 +52,47 @@ class AdaptationWorker:
         seed: int,
         suite: TaskSuite | None,
     ) -> None:
-        """Take what does not change during the run; demonstrations stay in shared memory.
+        """Hold what does not change during the run; demonstrations stay in shared memory.
 
-        A method that practises does so here, in environments of the suite: a slot stays one piece of pure work.
+        A method that learns from rollouts in meta-training has them here, in environments of the suite, so that a slot
+        stays pure work.
         """
         torch.set_num_threads(1)
         self._practise = SimulationWorker(suite).practise if suite is not None else None
         self._method, self._shapes, self._demonstrations, self._seed = method, shapes, demonstrations, seed
 
-    def gradient(
-        self,
-        parameters: Chunks,
-        iteration: int,
-        tasks: Sequence[str],
-        block: Sequence[Sequence[int]],
-        before: Sequence[Any] = (),
-    ) -> tuple[BlockReport, Chunks]:
-        """Return the sum of a block's gradients, which is all that need travel, and its report.
+    def gradient(self, parameters: Chunks, block: Block, previous: Sequence[Any] = ()) -> tuple[BlockReport, Chunks]:
+        """Return a block's report, and the sum of its gradients, which is all that must travel.
 
         Args:
             parameters: flat; they are copied first.
-            iteration: counts from 0.
-            tasks: of every slot of the iteration.
-            block: the slots of each of its groups.
-            before: Ray's references to the gradients of the blocks just before, which are then added.
+            block: which slots of which iteration.
+            previous: Ray's references to the gradients of the blocks just before it, to be added.
 
         Raises:
             WorkError: for a Python error in one of the slots.
         """
-        began = time.perf_counter()
+        started = time.perf_counter()
         own = unflatten(torch.from_numpy(from_chunks(parameters)), self._shapes)
         results = [
-            group_gradient(self._method, self._demonstrations, own, self._seed, iteration, tasks, slots, self._practise)
-            for slots in block
+            group_gradient(
+                self._method, self._demonstrations, own, self._seed, block.iteration, block.tasks, slots, self._practise
+            )
+            for slots in block.groups
         ]
-        gradient = add([result.gradient for result in results])
+        gradient = to_chunks(add([result.gradient for result in results]))
         metrics = [slot for result in results for slot in result.metrics]
         nonfinite = [slot for result in results for slot in result.nonfinite]
-        report = BlockReport(metrics, nonfinite, Span(began, time.perf_counter()))
-        if not before:
-            return report, to_chunks(gradient)
+        report = BlockReport(metrics, nonfinite, Span(started, time.perf_counter()))
+        if not previous:
+            return report, gradient
         import ray  # the local runner, which never comes here, does without
 
-        _, total = self.add(*ray.get(list(before)), to_chunks(gradient))
+        _, total = self.add(*ray.get(list(previous)), gradient)
         return report, total
 
     def add(self, *gradients: Chunks) -> tuple[Span, Chunks]:
-        """Return the sum of neighbouring gradients of the tree, and when it was made."""
-        began = time.perf_counter()
-        total = [add(pieces) for pieces in zip(*gradients, strict=True)]
-        return Span(began, time.perf_counter()), total
+        """Return when neighbouring gradients of the tree were added, and their sum."""
+        started = time.perf_counter()
+        total = [add(chunks) for chunks in zip(*gradients, strict=True)]
+        return Span(started, time.perf_counter()), total

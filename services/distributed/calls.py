@@ -1,73 +1,92 @@
-"""Calls of actors' methods, and the actors of a pool that make them."""
+"""Calls of actors' methods, the workers of a pool that execute them, and the listener of a pool: all without Ray."""
 
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
-import ray
+if TYPE_CHECKING:
+    from ray import ObjectRef
 
 
+@dataclass(eq=False)
 class Call:
-    """One call of an actor's method: where it runs, and what came of it.
+    """One call of an actor's method: where it runs, and its result.
 
-    Among the arguments of another call it stands for its last result, which need not be there yet. In a list among them
-    it stands for the reference to that: the other call begins without it, and fetches it when it needs it.
+    Among the arguments of another call it stands for its last result, which may still be pending. In a list among them
+    it stands for the reference to that result: the other call starts without it, and fetches it when it needs it.
     """
 
-    def __init__(
-        self,
-        number: int,
-        method: str,
-        arguments: tuple[Any, ...],
-        returns: int,
-        beside: "Call | None",
-        on: Any | None,
-        label: str,
-    ) -> None:
-        """See `Pool.submit`."""
-        self.number, self.method, self.arguments, self.returns = number, method, arguments, returns
-        self.beside, self.on, self.label = beside, on, label
-        self.worker: Worker | None = None
-        """The pool's actor that it runs on; none if that is an actor of one's own, or it is not sent yet."""
-        self.references: list[ray.ObjectRef] = []
-        """Of its results, once it is under way."""
-        self.began: float | None = None
-        """When it was seen to be at work: first in its actor's queue, with all that it is built upon."""
-        self.done = False
-        self.value: Any = None
-        """Its first result, once it is done."""
-        self.error: BaseException | None = None
-        """What it ended with in the place of results; so do all that are built upon it."""
-        self.deaths = 0
-        self.spare: Worker | None = None
-        """An actor that does the same, where its own is slow."""
-        self.twin: list[ray.ObjectRef] = []
-        """References to the spare's results."""
+    number: int
+    """Calls are sent in the order of their numbers."""
+    method: str
+    arguments: tuple[Any, ...]
+    returns: int
+    """How many results it has. The first is fetched, the others stay object references."""
+    same_worker_as: "Call | None"
+    actor: Any | None
+    """An actor outside the pool that it runs on."""
+    label: str
+    worker: "Worker | None" = None
+    """The pool's worker that it is sent to."""
+    references: list["ObjectRef"] = field(default_factory=list)
+    """References to its results, once it is sent."""
+    started: float | None = None
+    """When it was first seen to run: first in its worker's queue, with all its dependencies done."""
+    done: bool = False
+    value: Any = None
+    """Its first result, once it is done."""
+    error: BaseException | None = None
+    """What it raised in place of results; the calls that depend on it raise the same."""
+    deaths: int = 0
+    """Workers that died while it ran."""
+    backup: "Worker | None" = None
+    """A second worker for it, where its own is slow."""
+    backup_references: list["ObjectRef"] = field(default_factory=list)
+    """References to the backup's results."""
 
     @property
-    def built_upon(self) -> Iterator["Call"]:
+    def dependencies(self) -> Iterator["Call"]:
         """The calls among its arguments."""
-        parts = (part for given in self.arguments for part in (given if isinstance(given, list) else [given]))
-        return (part for part in parts if isinstance(part, Call))
+        for argument in self.arguments:
+            parts = argument if isinstance(argument, list) else [argument]
+            yield from (part for part in parts if isinstance(part, Call))
 
 
+@dataclass(eq=False)
 class Worker:
-    """One of the pool's actors: the process may be another one after a death, the number stays."""
+    """A place in the pool: its actor is replaced after a death, its number stays."""
 
-    def __init__(self, number: int, actor: Any) -> None:
-        """Take an actor that was just started."""
-        self.number, self.actor = number, actor
-        self.up = False
-        self.calls: list[Call] = []
-        """Sent and not ended, in their order."""
+    number: int
+    actor: Any
+    healthy: bool = False
+    """Whether its actor has started."""
+    in_flight: list[Call] = field(default_factory=list)
+    """Calls sent to it that have not ended, in their order."""
 
     @property
     def load(self) -> int:
-        """How many of its calls were put here because there was room."""
-        return sum(call.beside is None for call in self.calls)
+        """How many of its calls could have been sent to any worker."""
+        return sum(call.same_worker_as is None for call in self.in_flight)
 
 
-def now(given: Any) -> Any:
-    """Return what is sent for an argument of a call: for a call a reference to its last result."""
-    if isinstance(given, Call):
-        return given.references[-1]
-    return [now(part) for part in given] if isinstance(given, list) else given
+def referenced(argument: Any) -> Any:
+    """Return what is sent for an argument of a call: for a call, the reference to its last result."""
+    if isinstance(argument, Call):
+        return argument.references[-1]
+    return [referenced(part) for part in argument] if isinstance(argument, list) else argument
+
+
+class PoolListener:
+    """Receives the events of a pool, and ignores them."""
+
+    def worker_started(self) -> None:
+        """A worker started, and receives calls."""
+
+    def worker_lost(self) -> None:
+        """A worker that had started died, or was killed for slowness."""
+
+    def worker_stopped(self) -> None:
+        """A worker was stopped, for the pool is closed."""
+
+    def call_resent(self, call: Call) -> None:
+        """A call that was sent to a worker is sent to another."""

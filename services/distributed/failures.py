@@ -1,4 +1,4 @@
-"""What is kept of an error in a piece of pure work: all that is needed to do the piece again, alone."""
+"""What is stored of an error in a work item: all that is needed to run the item again, alone."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,10 +14,6 @@ from services.storage.provenance import library_versions
 MOST_BYTES = 10_000_000
 
 
-class FailureError(UserError):
-    """A file that holds no failure."""
-
-
 class Failure(BaseModel):
     """``failure.json``."""
 
@@ -28,9 +24,9 @@ class Failure(BaseModel):
     """The last line of the traceback."""
     trace: str
     piece: dict[str, str | int]
-    """What names the piece: iteration and slot; task, split, shots and draw; or task and attempt."""
+    """What identifies the work item: iteration and slot; task, split, shots and draw; or task and attempt."""
     checkpoint: str | None
-    """The state that the piece begins from; none where that is not trained yet."""
+    """The state that the item starts from; none where nothing is trained yet."""
     config: ExperimentConfig
     versions: dict[str, str]
 
@@ -39,28 +35,28 @@ class Failure(BaseModel):
 def keeping_failures(
     folder: Path, config: ExperimentConfig, checkpoint: Callable[[], Path | None] = lambda: None
 ) -> Iterator[None]:
-    """Work inside; an error in a piece of it is kept in ``failure.json``, so that the piece can be done again.
+    """Store an error of a work item inside in ``failure.json``, so that the item can be run again.
 
     Args:
-        folder: gets the file.
+        folder: of the file.
         config: of the experiment.
-        checkpoint: makes sure that the state is kept which the failed piece begins from, and returns where.
+        checkpoint: stores the state that the failed item starts from, and returns where.
 
     Raises:
-        RunError: names the piece, what went wrong, and the command that does it again.
+        RunError: names the item, the problem, and the command that runs it again.
     """
     try:
         yield
     except WorkError as error:
         path = folder / "failure.json"
         folder.mkdir(parents=True, exist_ok=True)
-        kept = checkpoint()
+        stored = checkpoint()
         failure = Failure(
             where=error.label,
             problem=error.problem,
             trace=error.trace,
             piece=dict(error.key),
-            checkpoint=None if kept is None else str(kept.resolve()),
+            checkpoint=None if stored is None else str(stored.resolve()),
             config=config,
             versions=library_versions(),
         )
@@ -72,11 +68,11 @@ def read_failure(path: Path) -> Failure:
     """Read ``failure.json``, or that of a folder.
 
     Raises:
-        FailureError: if there is none.
+        UserError: if there is none.
     """
     if path.is_dir():
         path = path / "failure.json"
     try:
         return Failure.model_validate_json(read_file(path, MOST_BYTES))
     except (OSError, ValidationError) as error:
-        raise FailureError(f"{path}: got {error}; wanted a failure.json that a program left behind") from error
+        raise UserError(f"{path}: got {error}; wanted a failure.json that a program left behind") from error

@@ -13,7 +13,7 @@ from services.distributed.timing import Span
 
 
 class StepReport(NamedTuple):
-    """What is told of an outer step beside the new parameters."""
+    """What an outer step yields beside the new parameters."""
 
     gradient_norm: float
     """Before clipping; where it is not finite, the step was not taken."""
@@ -27,12 +27,12 @@ class Learner:
         """Continue from `state`.
 
         Args:
-            state: where to go on.
+            state: the one to continue from.
             training: settings of the outer loop.
-            skip_nonfinite: whether an iteration without a step, for its gradient was not finite, counts as done.
+            skip_nonfinite: count an iteration as done whose step is not taken because its gradient is not finite.
         """
         torch.set_num_threads(1)
-        self._skip = skip_nonfinite
+        self._skip_nonfinite = skip_nonfinite
         self._step = OuterStep(state, training)
 
     def parameters(self) -> tuple[float, Chunks]:
@@ -41,12 +41,12 @@ class Learner:
 
     def step(self, gradient: Chunks) -> tuple[StepReport, Chunks]:
         """Step by the sum of all gradients; return the report and the new parameters."""
-        began = time.perf_counter()
+        started = time.perf_counter()
         norm = self._step(from_chunks(gradient))
-        if self._skip and not math.isfinite(norm):
+        if self._skip_nonfinite and not math.isfinite(norm):
             self._step.skip()
         ended, parameters = self.parameters()
-        return StepReport(norm, Span(began, ended)), parameters
+        return StepReport(norm, Span(started, ended)), parameters
 
     def state(self) -> OuterState:
         """Return everything a checkpoint needs."""

@@ -1,26 +1,24 @@
-"""What a run tells Ray of itself, so that Ray's dashboard and Prometheus show it: names, kinds, labels, and who counts.
+"""The metrics of a run that Ray's dashboard and Prometheus show, and the meters that record them.
 
 Ray puts ``ray_`` before each name, and ``_total`` behind that of a counter; docs/operations.md lists them.
 """
 
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from services.cli.live_view import Workers
-from services.distributed.pool_events import Witness
+from services.distributed.adaptation_worker import Block
+from services.distributed.calls import Call, PoolListener
 from services.distributed.timing import Timing
-
-if TYPE_CHECKING:
-    from services.distributed.calls import Call
 
 
 class Measure(NamedTuple):
-    """Something that is counted or measured."""
+    """A metric of a run."""
 
     name: str
     kind: Literal["counter", "gauge", "histogram"]
     meaning: str
     labels: tuple[str, ...] = ()
-    """Besides the suite, which all have."""
+    """Besides ``suite``, which all have."""
 
 
 ITERATIONS = Measure("dmil_iterations", "counter", "Iterations of meta-training done.")
@@ -56,29 +54,29 @@ MEASURES = (
 )  # fmt: skip
 
 BOUNDS = [0.001 * 2**power for power in range(18)]
-"""Of the histogram's buckets, in seconds: a millisecond to some two minutes."""
+"""Bounds of the histogram's buckets, in seconds: a millisecond to some two minutes."""
 NOTHING = 1e-300
-"""Ray's counters refuse 0; this is lost in whatever is added to it."""
+"""Added in place of 0, which Ray's counters refuse; it is lost in whatever is added to it."""
 
 
 class Meter:
-    """Takes what is counted and measured. Here nobody looks at it: where there is no Ray, it costs nothing."""
+    """Receives what is counted and measured, and ignores it: without Ray, metrics cost nothing."""
 
     def record(self, measure: Measure, value: float = 1.0, **labels: str) -> None:
         """Add to a counter, set a gauge, or observe a value of a histogram."""
 
     def iteration(self, timing: Timing) -> None:
-        """Count an iteration, and where its time went."""
+        """Count an iteration, and the seconds of its phases."""
 
 
 class RayMeter(Meter):
-    """Tells Ray's metrics: a number in memory each, which Ray collects every few seconds."""
+    """Records in Ray's metrics: a number in memory each, which Ray collects every few seconds."""
 
     def __init__(self, suite: str) -> None:
-        """Begin all counters that go without further labels.
+        """Start all counters that have no labels of their own.
 
         Args:
-            suite: the label that all of this process have.
+            suite: label of all metrics of this process.
         """
         self._metrics = {measure: _of_ray(measure, suite) for measure in MEASURES}
         for measure in MEASURES:
@@ -88,8 +86,8 @@ class RayMeter(Meter):
     def record(self, measure: Measure, value: float = 1.0, **labels: str) -> None:
         """Add to a counter, set a gauge, or observe a value of a histogram.
 
-        A counter that 0 or less is added to is there from then on, and stays as it is: an alert on its growth needs
-        to see it before it grows.
+        Adding 0 or less to a counter makes it exist without changing it: an alert on its growth needs to see it before
+        it grows.
         """
         metric = self._metrics[measure]
         if measure.kind == "counter":
@@ -100,7 +98,7 @@ class RayMeter(Meter):
             metric.observe(value, labels)
 
     def iteration(self, timing: Timing) -> None:
-        """Count an iteration, and where its time went."""
+        """Count an iteration, and the seconds of its phases."""
         self.record(ITERATIONS)
         self.record(ITERATION_SECONDS, timing.iteration)
         for phase, seconds in timing._asdict().items():
@@ -118,8 +116,8 @@ def _of_ray(measure: Measure, suite: str) -> Any:
     return metric.set_default_tags({"suite": suite})
 
 
-class Crew(Witness):
-    """Counts the workers of one kind, in one pool or several, and the slots that they are given again."""
+class WorkerCounter(PoolListener):
+    """Counts the workers of one kind, in one pool or several, and the slots that are computed again."""
 
     def __init__(self, kind: str, meter: Meter) -> None:
         """Begin with none."""
@@ -129,34 +127,33 @@ class Crew(Witness):
             meter.record(measure, 0.0, kind=kind)
 
     @property
-    def workers(self) -> Workers:
-        """How many there are, and how many were replaced."""
+    def count(self) -> Workers:
+        """How many are alive, and how many were replaced."""
         return Workers(self._kind, self._alive, self._lost)
 
-    def joined(self) -> None:
-        """Count a worker that came up."""
+    def worker_started(self) -> None:
+        """Count a worker that started."""
         self._meter.record(WORKERS_JOINED, kind=self._kind)
-        self._count(1)
+        self._add(1)
 
-    def lost(self) -> None:
-        """Count a worker that died or was ended for slowness."""
+    def worker_lost(self) -> None:
+        """Count a worker that died or was killed for slowness."""
         self._lost += 1
         self._meter.record(WORKERS_LOST, kind=self._kind)
-        self._count(-1)
+        self._add(-1)
 
-    def left(self) -> None:
-        """Count off a worker whose work is over."""
-        self._count(-1)
+    def worker_stopped(self) -> None:
+        """Subtract a worker whose pool is closed."""
+        self._add(-1)
 
-    def again(self, call: "Call") -> None:
-        """Count the slots of a gradient that another worker is asked for."""
-        if call.method == "gradient":
-            self.redone(sum(map(len, call.arguments[3])))
+    def call_resent(self, call: Call) -> None:
+        """Count the slots of a block that is computed again."""
+        self.slots_redone(sum(len(argument.slots) for argument in call.arguments if isinstance(argument, Block)))
 
-    def redone(self, slots: int) -> None:
-        """Count slots that are done again."""
+    def slots_redone(self, slots: int) -> None:
+        """Count slots that are computed again."""
         self._meter.record(SLOTS_REDONE, float(slots))
 
-    def _count(self, more: int) -> None:
-        self._alive += more
+    def _add(self, workers: int) -> None:
+        self._alive += workers
         self._meter.record(WORKERS, float(self._alive), kind=self._kind)

@@ -1,5 +1,6 @@
 """The runner that works in Ray actors."""
 
+import logging
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -7,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from dmil_core.errors import WorkError
 from services.cli.live_view import Workers
-from services.cli.progress import console
 from services.distributed.cluster import cpus, joined
 from services.distributed.errors import DeadlyCallError
-from services.distributed.metrics import Crew, Meter, RayMeter
+from services.distributed.metrics import Meter, RayMeter, WorkerCounter
 from services.distributed.ray_meta_training import RayMetaTraining
 from services.distributed.runner import Plan
 from services.distributed.simulation_worker import SimulationWorker, piece_of_call
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 POLITENESS = 10
 """How far a simulation beside meta-training stands back, see `os.nice`."""
+
+logger = logging.getLogger(__name__)
 
 
 class RayRunner:
@@ -45,9 +47,9 @@ class RayRunner:
         self._ray, self._pool = ray, Pool
         self._asked_for, self._gpus = workers, gpus
         if workers is not None and workers > cpus():
-            console.print(f"--workers {workers}: the cluster has {cpus()} CPUs now; further workers join as it grows")
+            logger.info(f"--workers {workers}: the cluster has {cpus()} CPUs now; further workers join as it grows")
         self.meter: Meter = RayMeter(suite.name)
-        self._crew = Crew("simulation", self.meter)
+        self._counter = WorkerCounter("simulation", self.meter)
         self._suite = ray.put(suite)
         self._beside: Pool | None = None
         self._training: RayMetaTraining | None = None
@@ -63,10 +65,10 @@ class RayRunner:
         return self._asked_for or cpus()
 
     @property
-    def staff(self) -> list[Workers]:
+    def worker_counts(self) -> list[Workers]:
         """The workers of each kind that there are, or were."""
-        crews = [self._crew] if self._training is None else [self._training.crew, self._crew]
-        return [crew.workers for crew in crews if crew.workers != (crew.workers.kind, 0, 0)]
+        counters = [self._counter] if self._training is None else [self._training.counter, self._counter]
+        return [counter.count for counter in counters if counter.count != (counter.count.kind, 0, 0)]
 
     def share(self, value: Any) -> Any:
         """Put `value` into the object store."""
@@ -77,10 +79,8 @@ class RayRunner:
         # While meta-training pauses, its workers keep their CPUs: the simulation's must not wait for one.
         pausing = self._meta_training()
         remote = self._ray.remote(num_cpus=0 if pausing else 1)(SimulationWorker)
-        size, enough = min(self.workers if pausing else self._wanted, len(calls)), self.workers
-        pool = self._pool(
-            lambda: remote.remote(self._suite), size, say=console.print, witness=self._crew, enough=enough
-        )
+        size = min(self.workers if pausing else self._wanted, len(calls))
+        pool = self._pool(lambda: remote.remote(self._suite), size, listener=self._counter, min_size=self.workers)
         try:
             with naming_the_deadly():
                 yield from pool.results(_submitted(pool, method, calls))
@@ -92,14 +92,14 @@ class RayRunner:
         if self._beside is None:
             remote = self._ray.remote(num_cpus=0)(PoliteSimulationWorker)
             self._beside = self._pool(
-                lambda: remote.remote(self._suite), 1, ahead=len(calls), say=console.print, witness=self._crew
+                lambda: remote.remote(self._suite), 1, max_in_flight=len(calls), listener=self._counter
             )
         return RaySimulation(self._beside, method, calls)
 
     def meta_train(self, plan: Plan) -> "RayMetaTraining":
         """Start the learner and the adaptation workers."""
         self._training = RayMetaTraining(
-            plan, lambda: self._wanted, gpus=self._gpus, meter=self.meter, enough=self.workers
+            plan, lambda: self._wanted, gpus=self._gpus, meter=self.meter, min_workers=self.workers
         )
         return self._training
 
@@ -133,7 +133,7 @@ class RaySimulation:
     def done(self) -> bool:
         """Tell, without waiting, whether all results are there."""
         with naming_the_deadly():
-            self._pool.take_note()
+            self._pool.poll()
         return all(call.done for call in self._calls)
 
     def results(self) -> list[Any]:

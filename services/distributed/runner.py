@@ -14,7 +14,7 @@ from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import MetaLearner
 from dmil_core.outer_loop import NonfiniteSlot, OuterState, groups, tasks_of
 from services.cli.live_view import Workers
-from services.distributed.adaptation_worker import AdaptationWorker
+from services.distributed.adaptation_worker import AdaptationWorker, Block
 from services.distributed.learner import Learner
 from services.distributed.metrics import Meter
 from services.distributed.simulation_worker import SimulationWorker
@@ -99,7 +99,7 @@ class Runner(Protocol):
         ...
 
     @property
-    def staff(self) -> Sequence[Workers]:
+    def worker_counts(self) -> Sequence[Workers]:
         """The workers that there are beside this process."""
         ...
 
@@ -148,7 +148,7 @@ class LocalRunner:
 
     workers = 1
     meter = Meter()
-    staff = ()
+    worker_counts = ()
 
     def __init__(self, suite: TaskSuite) -> None:
         """Work on the tasks of `suite`."""
@@ -187,9 +187,9 @@ class LocalMetaTraining:
 
     def iterations(self, count: int) -> Iterator[Iteration]:
         """Do the next `count` iterations, with all groups as one block."""
-        block = groups(self._plan.settings)
         for _ in range(count):
-            report, gradient = self._worker.gradient(self._parameters, self._next, self._plan.tasks(self._next), block)
+            block = Block(self._next, self._plan.tasks(self._next), groups(self._plan.settings))
+            report, gradient = self._worker.gradient(self._parameters, block)
             with _undisturbed():
                 stepped, self._parameters = self._learner.step(gradient)
             timing = Timing.of(self._ready, {0: [report.span]}, stepped.span)

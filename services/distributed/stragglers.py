@@ -1,33 +1,36 @@
-"""How long a call may take before its actor counts as slow: many times what its like took."""
+"""How long a call may take before its actor counts as slow: many times the median of its method."""
 
 from collections import defaultdict, deque
 from statistics import median
 
 from services.distributed.calls import Call
 
-SLOWNESS = 10
-"""A call that takes so many times what its like take is slow."""
-LEAST_SECONDS = 2.0
-"""But not before: a spare actor takes some seconds to start."""
-FIRST_SECONDS = 60.0
-"""What a call may take before it is known what its like take."""
-OWN_SECONDS = 30.0
-"""Nor before that where the actor is one of one's own: to lose it costs more."""
-PEERS = 3
-"""Calls of one method that must have ended for it to be known what its like take; the last hundred count."""
+TIMEOUT_FACTOR = 10
+"""A call is slow once it takes this many times the median of its method."""
+MIN_TIMEOUT_SECONDS = 2.0
+"""The shortest timeout: a backup takes some seconds to start."""
+MIN_OUTSIDE_TIMEOUT_SECONDS = 30.0
+"""The shortest timeout of a call to an actor outside the pool, which costs more to lose."""
+INITIAL_TIMEOUT_SECONDS = 60.0
+"""The timeout while too few durations are known."""
+MIN_SAMPLES = 3
+"""Durations of a method needed for its median; the last hundred count."""
 
 
-class Patience:
-    """Remembers what the calls of each method took."""
+class Timeouts:
+    """Timeouts of calls, from the durations of earlier calls of the same method."""
 
     def __init__(self) -> None:
-        self._seconds: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=100))
+        self._durations: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=100))
 
-    def took(self, call: Call, seconds: float) -> None:
-        """Remember a call that has ended."""
-        self._seconds[call.method].append(seconds)
+    def record(self, call: Call, seconds: float) -> None:
+        """Record the duration of a call that has ended."""
+        self._durations[call.method].append(seconds)
 
-    def with_call(self, call: Call) -> float:
-        """Return the seconds that a call may take."""
-        known, least = self._seconds[call.method], LEAST_SECONDS if call.on is None else OWN_SECONDS
-        return max(least, SLOWNESS * median(known)) if len(known) >= PEERS else FIRST_SECONDS
+    def seconds(self, call: Call) -> float:
+        """Return how long a call may take."""
+        durations = self._durations[call.method]
+        if len(durations) < MIN_SAMPLES:
+            return INITIAL_TIMEOUT_SECONDS
+        shortest = MIN_TIMEOUT_SECONDS if call.actor is None else MIN_OUTSIDE_TIMEOUT_SECONDS
+        return max(shortest, TIMEOUT_FACTOR * median(durations))

@@ -5,15 +5,15 @@ from typing import NamedTuple
 
 
 class Span(NamedTuple):
-    """When some work began and ended, in seconds of `time.perf_counter`: one clock for all processes of a machine."""
+    """When some work started and ended, in seconds of `time.perf_counter`: one clock for all processes of a machine."""
 
-    began: float
+    started: float
     ended: float
 
     @property
     def seconds(self) -> float:
         """How long it took."""
-        return self.ended - self.began
+        return self.ended - self.started
 
 
 class Timing(NamedTuple):
@@ -43,10 +43,10 @@ class Timing(NamedTuple):
             work: the gradient calls of each worker that had one.
             step: the outer step.
         """
-        begin = sum(min(span.began for span in spans) for spans in work.values()) / len(work)
+        begin = sum(min(span.started for span in spans) for spans in work.values()) / len(work)
         compute = sum(span.seconds for spans in work.values() for span in spans) / len(work)
         end = max(span.ended for spans in work.values() for span in spans)
-        return cls(begin - ready, compute, end - begin - compute, step.began - end, step.seconds)
+        return cls(begin - ready, compute, end - begin - compute, step.started - end, step.seconds)
 
     @property
     def iteration(self) -> float:

@@ -244,7 +244,7 @@ class Experiment:
         path, saved = None, -1
 
         def figures() -> Figures:
-            return figures_of(list(recent))._replace(**evaluations.found, workers=runner.staff)
+            return figures_of(list(recent))._replace(**evaluations.found, workers=runner.worker_counts)
 
         def save_now() -> Path | None:
             state = training.state()
@@ -317,7 +317,7 @@ class Experiment:
         tallies, at = Tallies(runner.meter), ""
 
         def figures() -> Figures:
-            return Figures(success=list(tallies), workers=runner.staff, at=at)
+            return Figures(success=list(tallies), workers=runner.worker_counts, at=at)
 
         with (
             Bar("evaluating", sum(len(each.episodes) for each in evaluator.adaptations), 0, "episodes", figures) as bar,

@@ -9,10 +9,10 @@ from ray import tune
 from ray.tune import Callback, RunConfig, TuneConfig
 from ray.tune.schedulers import AsyncHyperBandScheduler, TrialScheduler
 
+from dmil_core.errors import UserError
 from services.cli.progress import Bar
 from services.demonstrations.store import data_root
 from services.distributed.cluster import cpus
-from services.distributed.errors import NoRoomError
 from services.storage.remote import STORAGE
 from services.sweeps.folders import SweepFolder, TrialResult
 from services.sweeps.trial import HELD_OUT, ITERATION, run_trial, tracker_of
@@ -103,7 +103,7 @@ def tune_trials(sweep: SweepFolder) -> None:
     What came of each is in its folder then.
 
     Raises:
-        NoRoomError: if the cluster has no room for even one.
+        UserError: if the cluster has no room for even one.
     """
     results = {name: sweep.result(name) for name in sweep.trials}
     left = [name for name, result in results.items() if result is None or result.status == "failed"]
@@ -111,7 +111,7 @@ def tune_trials(sweep: SweepFolder) -> None:
         return
     resources = sweep.record.sweep.resources
     if resources.workers > cpus():
-        raise NoRoomError(
+        raise UserError(
             f"resources.workers: got {resources.workers} for each trial; the cluster has {cpus()} CPUs; wanted fewer"
         )
     for name in left:

@@ -12,9 +12,10 @@ import pytest
 import ray
 
 from dmil_core.errors import RunError
-from services.distributed.actor_pool import DEATHS_ALLOWED, Pool
+from services.distributed.actor_pool import MAX_DEATHS, Pool
 from services.distributed.calls import Worker
 from services.distributed.errors import DeadlyCallError, LostError
+from services.distributed.metrics import Meter, WorkerCounter
 
 pytestmark = pytest.mark.alone  # some are to be overtaken for their slowness, the others not
 
@@ -72,19 +73,26 @@ def pid_of(worker: Worker | None) -> int:
     return ray.get(worker.actor.__ray_call__.remote(lambda counter: os.getpid()))
 
 
-def test_every_call_is_made_once(make):
-    pool = Pool(make, 2)
-    assert sorted(pool.map("one", [(number,) for number in range(7)])) == [(number, number) for number in range(7)]
-    assert list(pool.map("one", [])) == []
-    assert pool.restarts == 0
+@pytest.fixture
+def counter() -> WorkerCounter:
+    return WorkerCounter("counter", Meter())
+
+
+def test_every_call_is_made_once(make, counter: WorkerCounter):
+    pool = Pool(make, 2, listener=counter)
+    calls = [pool.submit("one", number) for number in range(7)]
+    assert sorted(pool.results(calls)) == [(number, number) for number in range(7)]
+    assert list(pool.results([])) == []
+    assert counter.count == ("counter", 2, 0)
     pool.close()
+    assert counter.count == ("counter", 0, 0)
 
 
-@pytest.mark.parametrize("ahead", [1, 2, 9])
-def test_calls_build_upon_calls_that_are_under_way(make, ahead: int):
-    pool = Pool(make, 2, ahead)
+@pytest.mark.parametrize("max_in_flight", [1, 2, 9])
+def test_calls_build_upon_calls_that_are_under_way(make, max_in_flight: int):
+    pool = Pool(make, 2, max_in_flight)
     numbers = [pool.submit("two", number, returns=2) for number in range(5)]
-    sums = [pool.submit("add", *part, returns=2, beside=part[-1]) for part in (numbers[:2], numbers[2:])]
+    sums = [pool.submit("add", *part, returns=2, same_worker_as=part[-1]) for part in (numbers[:2], numbers[2:])]
     total = pool.submit("add", *sums, returns=2)
     last = pool.submit("one", total)
     assert pool.result(last) == 10
@@ -94,7 +102,7 @@ def test_calls_build_upon_calls_that_are_under_way(make, ahead: int):
 
 
 def test_a_list_of_calls_is_fetched_by_the_actor_itself(make):
-    pool = Pool(make, 2, ahead=2)
+    pool = Pool(make, 2, max_in_flight=2)
     numbers = [pool.submit("two", number, returns=2) for number in range(3)]
     total = pool.submit("fetch", numbers)
     assert pool.result(total) == 3
@@ -103,94 +111,100 @@ def test_a_list_of_calls_is_fetched_by_the_actor_itself(make):
 
 
 @pytest.mark.parametrize("method", ["one", "add"])
-def test_what_builds_upon_a_lost_call_is_made_again_too(make, wait_for, tmp_path: Path, method: str):
-    pool = Pool(make, 2, ahead=2)
+def test_what_builds_upon_a_lost_call_is_made_again_too(
+    make, counter: WorkerCounter, wait_for, tmp_path: Path, method: str
+):
+    pool = Pool(make, 2, max_in_flight=2, listener=counter)
     own = make()
     lost = pool.submit("die", tmp_path, 2, 5, returns=2)
     kept = pool.submit("two", 6, returns=2)
-    both = pool.submit("add", lost, kept, returns=2, beside=kept)
-    there = pool.submit("two", both, returns=2, on=own)
+    both = pool.submit("add", lost, kept, returns=2, same_worker_as=kept)
+    there = pool.submit("two", both, returns=2, actor=own)
     after = [pool.submit(method, there, returns=2 if method == "add" else 1) for _ in range(3)]
     assert pool.result(there) == "made 11"
     assert [pool.result(call) == 11 or ray.get(call.references[-1]) == 11 for call in after] == [True] * 3
-    assert pool.restarts == 2
-    wait_for(lambda: bool(pool.take_note() or len(pool) == 2), "the replacement")
+    assert counter.count.restarted == 2
+    wait_for(lambda: bool(pool.poll() or len(pool) == 2), "the replacement")
     pool.close()
 
 
-def test_a_call_that_kills_is_given_up(make, tmp_path: Path):
-    pool = Pool(make, 2)
+def test_a_call_that_kills_is_given_up(make, counter: WorkerCounter, tmp_path: Path):
+    pool = Pool(make, 2, listener=counter)
     pool.submit("one", 1)
-    deadly = pool.submit("die", tmp_path, DEATHS_ALLOWED, 7, returns=2, label="a deadly call")
+    deadly = pool.submit("die", tmp_path, MAX_DEATHS, 7, returns=2, label="a deadly call")
     after = pool.submit("add", deadly, 1, returns=2)
     with pytest.raises(DeadlyCallError, match="a deadly call: 3 workers ended") as error:
         pool.result(deadly)
     assert error.value.call is deadly
-    assert pool.restarts == DEATHS_ALLOWED
+    assert counter.count.restarted == MAX_DEATHS
     pool.retry(deadly)
     pool.result(after)
     assert ray.get(after.references[-1]) == 8
     pool.close()
 
 
-def test_calls_that_wait_behind_a_deadly_one_are_not_suspected(make, tmp_path: Path):
-    pool, count = Pool(make, 1, ahead=DEATHS_ALLOWED), DEATHS_ALLOWED
+def test_calls_that_wait_behind_a_deadly_one_are_not_suspected(make, counter: WorkerCounter, tmp_path: Path):
+    pool, count = Pool(make, 1, max_in_flight=MAX_DEATHS, listener=counter), MAX_DEATHS
     for number in range(count):
         (tmp_path / str(number)).mkdir()
     deaths = [pool.submit("die", tmp_path / str(number), 1, number) for number in range(count)]
     assert [pool.result(call)[1] for call in deaths] == [*range(count)], "the last saw as many deaths as are allowed"
-    assert pool.restarts == count
+    assert counter.count.restarted == count
     pool.close()
 
 
-def test_a_hung_actor_is_overtaken(make, monkeypatch: pytest.MonkeyPatch):
+def test_a_hung_actor_is_overtaken(make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture):
     """Both where others wait for what it makes, and where it is the only one."""
-    monkeypatch.setattr("services.distributed.stragglers.LEAST_SECONDS", 0.5)
+    monkeypatch.setattr("services.distributed.stragglers.MIN_TIMEOUT_SECONDS", 0.5)
     for size in (1, 2):
-        said: list[str] = []
-        pool = Pool(make, size, ahead=2, say=said.append)
-        list(pool.map("one", [(number,) for number in range(10)]))
+        counter = WorkerCounter("counter", Meter())
+        pool = Pool(make, size, max_in_flight=2, listener=counter)
+        list(pool.results([pool.submit("one", number) for number in range(10)]))
         hung = pid_of(pool._workers[0])
         os.kill(hung, signal.SIGSTOP)
         numbers = [pool.submit("one", number, label=f"number {number}") for number in range(4)]
         waiting = pool.submit("fetch", [numbers[0]])
         assert pool.result(waiting) == 0
         assert [pool.result(call) for call in numbers] == [0, 1, 2, 3]
-        assert any("worker 0 is slow: number" in words and "also given to another" in words for words in said), said
-        assert pool.restarts == 1
+        assert "worker 0 is slow: number" in caplog.text
+        assert "a backup runs it too" in caplog.text
+        caplog.clear()
+        assert counter.count.restarted == 1
         assert hung not in map(pid_of, pool._workers)
         pool.close()
 
 
-def test_where_the_slow_actor_is_first_its_answer_counts(make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("services.distributed.stragglers.LEAST_SECONDS", 0.5)
-    pool = Pool(make, 2)
-    list(pool.map("sleep", [(0.01, tmp_path)] * 10))
-    for _ in range(DEATHS_ALLOWED + 1):  # a spare that is let go while it starts is no failure to start
+def test_where_the_slow_actor_is_first_its_answer_counts(
+    make, counter: WorkerCounter, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("services.distributed.stragglers.MIN_TIMEOUT_SECONDS", 0.5)
+    pool = Pool(make, 2, listener=counter)
+    list(pool.results([pool.submit("sleep", 0.01, tmp_path) for _ in range(10)]))
+    for _ in range(MAX_DEATHS + 1):  # a backup that is dropped while it starts is no failure to start
         slow = pool.submit("sleep", 0.8, tmp_path)
         pid, _ = pool.result(slow)
         assert pid in map(pid_of, pool._workers)
     slow = pool.submit("sleep", 3.0, tmp_path)
     pid, _ = pool.result(slow)
     assert pid in map(pid_of, pool._workers)
-    assert pool.restarts == 0
+    assert counter.count.restarted == 0
     pool.close()
 
 
-def test_killing_all_actors_again_and_again_loses_nothing(make, tmp_path: Path):
-    pool = Pool(make, 2, ahead=2)
+def test_killing_all_actors_again_and_again_loses_nothing(make, counter: WorkerCounter, tmp_path: Path):
+    pool = Pool(make, 2, max_in_flight=2, listener=counter)
     draw = random.Random(0)
     killed = 0
     for _ in range(4):
         calls = [pool.submit("sleep", 0.02, tmp_path, returns=2) for _ in range(10)]
         sums = [pool.submit("add", *calls[first : first + 5], returns=2) for first in (0, 5)]
         for worker in draw.sample(pool._workers, draw.choice([1, 2])):
-            if worker.up:
+            if worker.healthy:
                 os.kill(pid_of(worker), signal.SIGKILL)
                 killed += 1
         assert [ray.get(part.references[-1]) for part in sums if pool.result(part)] == [5, 5]
     assert killed >= 4
-    assert 1 <= pool.restarts <= killed, "one that was idle may have been killed unnoticed"
+    assert 1 <= counter.count.restarted <= killed, "one that was idle may have been killed unnoticed"
     pool.close()
 
 
@@ -199,13 +213,13 @@ def test_actors_that_cannot_start_are_told(make_broken):
         Pool(make_broken, 1)
 
 
-def test_the_death_of_an_actor_of_ones_own_is_told(make, tmp_path: Path):
-    pool, own = Pool(make, 1), make()
+def test_the_death_of_an_actor_of_ones_own_is_told(make, counter: WorkerCounter, tmp_path: Path):
+    pool, own = Pool(make, 1, listener=counter), make()
     first = pool.submit("two", 1, returns=2)
-    deadly = pool.submit("die", tmp_path, 1, first, on=own)
-    with pytest.raises(LostError, match="the process that was to do it ended"):
+    deadly = pool.submit("die", tmp_path, 1, first, actor=own)
+    with pytest.raises(LostError, match="its actor died"):
         pool.result(pool.submit("one", deadly))
-    assert pool.restarts == 0
+    assert counter.count.restarted == 0
     pool.close()
 
 

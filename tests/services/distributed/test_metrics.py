@@ -51,12 +51,12 @@ note, port = Path("killed").absolute(), Path("port")
 
 class Mortal(AdaptationWorker):
     # One of them is killed in the middle of its work, in the third iteration.
-    def gradient(self, parameters, iteration, tasks, block, before=()):
-        if iteration == 2:
+    def gradient(self, parameters, block, previous=()):
+        if block.iteration == 2:
             with suppress(FileExistsError):  # the other one was first
                 note.touch(exist_ok=False)
                 os.kill(os.getpid(), signal.SIGKILL)
-        return super().gradient(parameters, iteration, tasks, block, before)
+        return super().gradient(parameters, block, previous)
 
 
 services.distributed.ray_meta_training.AdaptationWorker = Mortal
@@ -127,4 +127,4 @@ def test_every_metric_is_documented():
 
 def test_without_ray_nobody_listens():
     assert type(LocalRunner.meter) is Meter
-    assert not LocalRunner.staff
+    assert not LocalRunner.worker_counts

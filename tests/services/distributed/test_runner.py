@@ -106,11 +106,11 @@ def test_a_killed_worker_changes_nothing(
 
         _iteration = 0
 
-        def gradient(self, parameters, iteration, tasks, block, before=()):
-            if where == "gradient" and iteration == 2:
+        def gradient(self, parameters, block, previous=()):
+            if where == "gradient" and block.iteration == 2:
                 self._die_once()
-            self._iteration = iteration
-            return super().gradient(parameters, iteration, tasks, block, before)
+            self._iteration = block.iteration
+            return super().gradient(parameters, block, previous)
 
         def add(self, *gradients):
             if where == "add" and self._iteration >= 2:
@@ -135,7 +135,7 @@ def test_a_killed_worker_changes_nothing(
         disturbed = follow(meta_training, disturb=kill)
     assert note.exists()
     assert isinstance(meta_training, RayMetaTraining)
-    assert meta_training.restarts == 1
+    assert meta_training.counter.count.restarted == 1
     assert_same_bits(disturbed, wanted)
 
 
