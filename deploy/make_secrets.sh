@@ -1,6 +1,6 @@
 #!/bin/sh
-# Draw every secret that the deployments read from a file, into deploy/secrets or the folder given; keep what is there.
-# The folder is closed to others. The files in it are not, for containers read them as users of their own.
+# Generate the secrets that deployments read from files, in deploy/secrets or the given folder; keep existing ones.
+# Other users cannot enter the folder. The files in it are readable, because containers read them as other users.
 set -eu
 folder=${1:-$(dirname "$0")/secrets}
 mkdir -p "$folder"
@@ -9,7 +9,7 @@ cd "$folder"
 
 drawn() { od -An -v -tx1 -N "$1" /dev/urandom | tr -d ' \n'; }
 
-keep() { # a secret's file: what comes in, if there is none yet
+keep() { # write stdin to a secret's file unless it exists
     if [ -s "$1" ]; then
         echo "$1: kept"
     else
@@ -23,8 +23,8 @@ keep() { # a secret's file: what comes in, if there is none yet
 drawn 32 | keep ray_token
 drawn 24 | keep postgres_password
 drawn 24 | keep grafana_password
-# The object store shares two keys with each of its clients: never one of these files without the others.
-# MLflow's open everything, for it makes the buckets; those of Ray's processes open the bucket dmil alone.
+# The object store shares two keys with each of its clients, so these files are only written together.
+# MLflow's keys have all rights, because it creates the buckets; those of Ray's processes open the bucket dmil alone.
 if ! [ -s store.json ] || ! [ -s store_credentials ] || ! [ -s storage_credentials ]; then
     rm -f store.json store_credentials storage_credentials
     access=$(drawn 10) secret=$(drawn 24) own_access=$(drawn 10) own_secret=$(drawn 24)

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Give the command the database's password from a file: libpq takes it from PGPASSWORD, and never from a command line.
+# Run a command with the database's password from a file: libpq reads PGPASSWORD, so no command line contains it.
 set -eu
 if [ -n "${PGPASSWORD_FILE:-}" ]; then
     PGPASSWORD=$(cat "$PGPASSWORD_FILE")
