@@ -26,7 +26,7 @@ from services.storage.provenance import git_commit, library_versions
 from services.storage.run_folders import find_folder, new_folder
 from services.suites.registry import open_suite
 from services.sweeps.folders import MARK, SweepFolder, SweepRecord
-from services.sweeps.settings import Size, Sweep, planned
+from services.sweeps.settings import Preset, Sweep, planned
 from services.sweeps.table_formats import publish, show, write_tables
 from services.tracking import Tracker, tracking_uri
 from services.tracking.delivery import IDENTITY, Identity
@@ -42,8 +42,9 @@ class Arguments:
 
     sweep: Annotated[str | None, tyro.conf.Positional] = None
     """File of the sweep, or the name of one in tune_configs."""
-    scale: Size = "quick"
-    """Size of every training: smoke (to see that all works), quick (some minutes each on one core), paper."""
+    preset: Annotated[Preset, tyro.conf.arg(aliases=["--scale"])] = "quick"
+    """Settings that every training begins with: smoke (to see that all works), quick (some minutes each on one core)
+    or paper."""
     suites: tuple[str, ...] | None = None
     """Suites in place of the sweep's."""
     seeds: tuple[int, ...] | None = None
@@ -51,7 +52,7 @@ class Arguments:
     runs: Path = Path("runs")
     """The folder that the sweep's own folder is made in, and where trained configurations are looked for."""
     name: str | None = None
-    """Name of the sweep's folder; that of its file and the scale with the time if not given."""
+    """Name of the sweep's folder; that of its file and the preset with the time if not given."""
     resume: str | None = None
     """Name or folder of a sweep to go on with: what is finished stays, what failed or was cut off goes on."""
     quiet: Quiet = False
@@ -120,19 +121,19 @@ def _begun(given: Arguments) -> SweepFolder:
         raise UserError(f"SWEEP: got none; wanted a file as tune_configs/em.yaml, or one of {', '.join(known)}")
     file = CONFIGS / f"{given.sweep}.yaml" if given.sweep in known else Path(given.sweep)
     try:
-        sweep = _read(file).at(given.scale, given.suites or (), given.seeds or ())
+        sweep = _read(file).at(given.preset, given.suites or (), given.seeds or ())
     except ValidationError as error:
         raise UserError("\n".join(f"--{line}" for line in explain(error).splitlines())) from error
     for value, flag in ((sweep.suites, "--suites"), (sweep.seeds, "--seeds")):
         if len(set(value)) < len(value):
             raise UserError(f"{flag}: got {' '.join(map(str, value))}; wanted each once")
-    for trial in planned(sweep, given.scale):
+    for trial in planned(sweep, given.preset):
         open_suite(trial.config.suite)
-    name = given.name or f"{file.stem}-{given.scale}-{datetime.now():%Y%m%d-%H%M%S}"
+    name = given.name or f"{file.stem}-{given.preset}-{datetime.now():%Y%m%d-%H%M%S}"
     folder = new_folder(name, given.runs, MARK)
     record = SweepRecord(
         name=file.stem,
-        size=given.scale,
+        preset=given.preset,
         sweep=sweep,
         began=datetime.now(UTC),
         command=shlex.join(["python", "-m", "services.tune_sweep", *sys.argv[1:]]),
@@ -156,9 +157,9 @@ def _introduce(tracker: Tracker, sweep: SweepFolder) -> None:
     record, settings = sweep.record, sweep.record.sweep
     suites, seeds = " ".join(settings.suites), " ".join(map(str, settings.seeds))
     methods = " ".join(dict.fromkeys(trial.config.method.name for trial in sweep.trials.values()))
-    tracker.parameters({"sweep": record.name, "scale": record.size, "suites": suites, "seeds": seeds})
+    tracker.parameters({"sweep": record.name, "scale": record.preset, "suites": suites, "seeds": seeds})
     tracker.parameters({"rows": ", ".join(settings.row_names), "trials": len(sweep.trials)})
-    tracker.tags({"sweep": record.name, "scale": record.size, "suite": suites, "method": methods, "seed": seeds})
+    tracker.tags({"sweep": record.name, "scale": record.preset, "suite": suites, "method": methods, "seed": seeds})
     tracker.tags({"git_commit": record.commit, "command": record.command})
 
 

@@ -94,7 +94,7 @@ def write_sweep_page(tables: Tables, comparison: Comparison, path: Path) -> None
     trials = ", ".join(f"{count} {status}" for status, count in tables.trials.items())
     paper = f" Beside it stands {tables.paper.replace('table', 'Table ')} of the paper." if tables.paper else ""
     lead = [
-        f"{tables.metric.replace('_', ' ').capitalize()} at scale {tables.size}; trials: {trials}.{paper} Begun "
+        f"{tables.metric.replace('_', ' ').capitalize()} at preset {tables.preset}; trials: {trials}.{paper} Begun "
         f"{tables.began}, commit {tables.commit[:12]}."
     ]
     lead += [f"Failed: {name}: {error}" for name, error in tables.failed.items()]

@@ -14,13 +14,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
 from dmil_core.configs import EvaluationConfig, ExperimentConfig
 from dmil_core.errors import UserError, explain
 from services.storage.checksums import sha256
 from services.storage.files import inside, read_file, write_file
-from services.sweeps.settings import PlannedTrial, Size, Sweep, planned
+from services.sweeps.settings import PlannedTrial, Preset, Sweep, planned
 
 Record = TypeVar("Record", bound=BaseModel)
 MOST_BYTES = 2**22
@@ -44,9 +44,10 @@ class SweepRecord(_Record):
 
     name: str
     """Of the file."""
-    size: Size
+    preset: Preset = Field(validation_alias=AliasChoices("preset", "size"))
+    """Older records call it size."""
     sweep: Sweep
-    """As it is at this size."""
+    """As it is at this preset."""
     began: datetime
     command: str
     commit: str
@@ -93,7 +94,7 @@ class SweepFolder:
     @cached_property
     def trials(self) -> dict[str, PlannedTrial]:
         """All trials by name."""
-        return {trial.name: trial for trial in planned(self.record.sweep, self.record.size)}
+        return {trial.name: trial for trial in planned(self.record.sweep, self.record.preset)}
 
     def of_trial(self, name: str) -> Path:
         """Return the folder of a trial, which may not be there yet."""

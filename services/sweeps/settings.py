@@ -1,4 +1,4 @@
-"""What a sweep is: its grid, its seeds and suites, its sizes, as ``tune_configs/*.yaml`` say it."""
+"""What a sweep is: its grid, its seeds and suites, its budgets, as ``tune_configs/*.yaml`` have it."""
 
 import itertools
 import math
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AliasChoices, Field, model_validator
 
 from dmil_core.configs import EvaluationConfig, ExperimentConfig, SuiteConfig, SuiteName, preset_of
 from dmil_core.errors import UserError
@@ -22,7 +22,7 @@ from services.suites.registry import open_suite
 Name = Annotated[str, Field(min_length=1, max_length=60)]
 Overrides = dict[str, Any]
 """Settings of an experiment by section, as in a file of ``--config``."""
-Size = Literal["smoke", "quick", "paper"]
+Preset = Literal["smoke", "quick", "paper"]
 
 
 class Resources(Settings):
@@ -34,8 +34,8 @@ class Resources(Settings):
     """GPUs of each worker, which may be less than one: as many workers share one."""
 
 
-class Scale(Settings):
-    """What a sweep does at one size: its budget."""
+class Budget(Settings):
+    """What a sweep changes at one preset."""
 
     suites: tuple[SuiteName, ...] | None = None
     """In place of the sweep's."""
@@ -123,36 +123,36 @@ class Sweep(Settings):
     splits: tuple[Split, ...] = ("meta-training", "meta-testing")
     """What the trials are evaluated on, and the table shows."""
     resources: Resources = Resources()
-    scales: dict[Size, Scale] = Field(default_factory=dict)
-    """The budget of each size, where it has one of its own."""
+    presets: dict[Preset, Budget] = Field(default_factory=dict, validation_alias=AliasChoices("presets", "scales"))
+    """The budget at each preset that has one of its own; older files call them scales."""
 
     @model_validator(mode="after")
     def _one_kind(self) -> "Sweep":
         if bool(self.variants) == bool(self.search):
             raise ValueError("variants, search: got both or neither; wanted one of them")
-        for size, scale in self.scales.items():
-            if unknown := sorted(set(scale.variants) - set(self.variants)):
-                raise ValueError(f"scales.{size}.variants: got {unknown[0]!r}; wanted of {', '.join(self.variants)}")
+        for preset, budget in self.presets.items():
+            if unknown := sorted(set(budget.variants) - set(self.variants)):
+                raise ValueError(f"presets.{preset}.variants: got {unknown[0]!r}; wanted of {', '.join(self.variants)}")
         if self.baseline is not None and self.baseline not in self.row_names:
             raise ValueError(f"baseline: got {self.baseline!r}; wanted one of {', '.join(self.row_names)}")
         return self
 
-    def at(self, size: Size, suites: Sequence[str] = (), seeds: Sequence[int] = ()) -> "Sweep":
-        """Return the sweep as it is at one size, with other suites and seeds if they are given.
+    def at(self, preset: Preset, suites: Sequence[str] = (), seeds: Sequence[int] = ()) -> "Sweep":
+        """Return the sweep as it is at one preset, with other suites and seeds if they are given.
 
         Raises:
             ValidationError: for a name that no suite can have, or a seed that is none.
         """
-        scale = self.scales.get(size, Scale())
+        budget = self.presets.get(preset, Budget())
         changes: dict[str, Any] = {
-            "variants": {name: _laid_over(own, scale.variants.get(name, {})) for name, own in self.variants.items()},
-            "suites": tuple(suites) or scale.suites or self.suites,
-            "seeds": tuple(seeds) or scale.seeds or self.seeds,
-            "settings": _laid_over(self.settings, scale.settings),
-            "scales": {},
+            "variants": {name: _laid_over(own, budget.variants.get(name, {})) for name, own in self.variants.items()},
+            "suites": tuple(suites) or budget.suites or self.suites,
+            "seeds": tuple(seeds) or budget.seeds or self.seeds,
+            "settings": _laid_over(self.settings, budget.settings),
+            "presets": {},
         }
         if self.search is not None:
-            changes["search"] = {**self.search.model_dump(), "samples": scale.samples or self.search.samples}
+            changes["search"] = {**self.search.model_dump(), "samples": budget.samples or self.search.samples}
         return Sweep.model_validate({**self.model_dump(), **changes})
 
     @property
@@ -189,23 +189,23 @@ class PlannedTrial(Settings):
     """By the table's row."""
 
 
-def planned(sweep: Sweep, size: Size) -> list[PlannedTrial]:
+def planned(sweep: Sweep, preset: Preset) -> list[PlannedTrial]:
     """Return the trials of a sweep.
 
     Args:
-        sweep: as it is at this size.
-        size: of the preset.
+        sweep: as it is at this preset.
+        preset: that its trials begin with.
 
     Raises:
         UserError: for a suite or for settings that there are not; names where these come from.
     """
     variants = sweep.search.variants() if sweep.search else sweep.variants
-    evaluation: Overrides = {"shots": list(sweep.shots)} | ({} if size == "smoke" else {"episodes": sweep.episodes})
+    evaluation: Overrides = {"shots": list(sweep.shots)} | ({} if preset == "smoke" else {"episodes": sweep.episodes})
     layers = {"shots, episodes": {"evaluation": evaluation}, "settings": sweep.settings}
     trials = []
     for suite, (variant, own), seed in itertools.product(sweep.suites, variants.items(), sweep.seeds):
         method = method_named(own if "name" in own.get("method", {}) else sweep.settings)
-        settings = preset_of(suite, size, method).model_dump()
+        settings = preset_of(suite, preset, method).model_dump()
         for origin, overrides in {**layers, f"variants.{variant}": own, "seeds": {"seed": seed}}.items():
             settings = merged(settings, overrides, origin)
         config = checked(settings, f"{variant} on {suite}: ")

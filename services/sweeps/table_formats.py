@@ -57,7 +57,7 @@ def _lines(found: Cell | None, digits: int) -> list[str]:
 def _head(tables: Tables) -> str:
     trials = ", ".join(f"{count} {status}" for status, count in tables.trials.items())
     against = f"; beside it {tables.paper.replace('table', 'Table ')} of the paper" if tables.paper else ""
-    return f"{tables.what}: {tables.metric.replace('_', ' ')} at scale {tables.size}{against} (trials: {trials})"
+    return f"{tables.what}: {tables.metric.replace('_', ' ')} at preset {tables.preset}{against} (trials: {trials})"
 
 
 def show(tables: Tables, sweep: SweepFolder) -> None:

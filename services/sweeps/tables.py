@@ -32,7 +32,7 @@ class Tables(BaseModel):
     what: str
     paper: str | None
     metric: Metric
-    size: str
+    preset: str
     began: str
     commit: str
     command: str
@@ -108,7 +108,7 @@ def tables_of(sweep: SweepFolder, comparison: Comparison | None = None) -> Table
         what=settings.what,
         paper=settings.paper,
         metric=settings.metric,
-        size=record.size,
+        preset=record.preset,
         began=f"{record.began:%Y-%m-%d %H:%M} UTC",
         commit=record.commit,
         command=record.command,

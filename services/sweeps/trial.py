@@ -88,7 +88,7 @@ def run_trial(folder: Path, name: str, demonstrations: Path, environment: Mappin
     with log_file as log, redirect_stdout(log), console_logging(quiet=False):
         try:
             introduce(tracker, trial.config)
-            tracker.tags({"sweep": sweep.record.name, "variant": trial.variant, "scale": sweep.record.size})
+            tracker.tags({"sweep": sweep.record.name, "variant": trial.variant, "scale": sweep.record.preset})
             sweep.finish(name, _run(sweep, trial, DemoStore(demonstrations, given_storage()), tracker))
             status = "FINISHED"
         except Exception as error:  # noqa: BLE001  whatever it is, it is shown, and the other trials go on

@@ -91,7 +91,7 @@ def test_every_command_line_is_taken(source):
         ("python -m services.meta_train --preset ml10-fast", "ml10-fast"),
         ("python -m services.meta_train --preset ml10-quick --iterations 3", "--iterations"),
         ("python -m services.tune_sweep sub-skills", "sub-skills"),
-        ("python -m services.tune_sweep sub_skills --scale large", "large"),
+        ("python -m services.tune_sweep sub_skills --preset large", "large"),
         ("python -m services.distributed.cluster", "teach them"),
         ("python /usr/local/bin/make_buckets.py mlflow", "make_buckets.py"),
         ("prometheus --config=x", "--config"),

@@ -77,10 +77,10 @@ def test_a_stopped_job_has_its_checkpoint_and_goes_on_to_the_same_bits(submit, j
 
 @pytest.mark.thorough
 def test_a_sweep_is_a_job_too(submit, workplace: Path):
-    small = {"scales": {"smoke": {"settings": {"training": {"iterations": 2, "checkpoint_every": 2}}}}}
+    small = {"presets": {"smoke": {"settings": {"training": {"iterations": 2, "checkpoint_every": 2}}}}}
     sweep = {"what": "a test", "suites": ["ml10"], "seeds": [0], "variants": {"one": {}}, "shots": [1], **small}
     (workplace / "small.yaml").write_text(json.dumps(sweep))
-    printed = submit("sweep", "tune_sweep", str(workplace / "small.yaml"), "--scale", "smoke", "--name", "small")
+    printed = submit("sweep", "tune_sweep", str(workplace / "small.yaml"), "--preset", "smoke", "--name", "small")
     assert "1 finished" in printed
     tables = json.loads((workplace / "runs" / "small" / "tables" / "tables.json").read_text())
     assert tables["trials"] == {"finished": 1}

@@ -26,7 +26,7 @@ def make(runs: Path, solved: Solved, finished: Sequence[str] = (), **changes: ob
         "paper": "table4", **changes,
     }  # fmt: skip
     record = SweepRecord(
-        name="made-up", size="smoke", sweep=Sweep.model_validate(settings), began=datetime(2026, 1, 2, tzinfo=UTC),
+        name="made-up", preset="smoke", sweep=Sweep.model_validate(settings), began=datetime(2026, 1, 2, tzinfo=UTC),
         command="python -m services.tune_sweep made-up", commit="abc", versions={},
     )  # fmt: skip
     sweep = SweepFolder.make(runs / "made-up", record)

@@ -1,4 +1,4 @@
-"""What a sweep's file says: those of the project at every size, and mistakes in one of a user's own."""
+"""What a sweep's file says: those of the project at every preset, and mistakes in one of a user's own."""
 
 from pathlib import Path
 
@@ -9,9 +9,10 @@ from pydantic import ValidationError
 
 from dmil_core.configs import EvaluationConfig, preset_of
 from dmil_core.errors import UserError
-from services.sweeps.folders import evaluated, trained
+from services.sweeps.folders import SweepFolder, evaluated, trained
 from services.sweeps.settings import Range, Sweep, planned
 from services.tune_sweep import CONFIGS
+from tests.services.sweeps.made_up import better, make
 
 NAMES = ["bilevel", "continuity", "em", "finetune_steps", "kitchen_k", "methods", "negatives", "search", "sub_skills"]
 SMALL = {"what": "a test", "suites": ["ml10"], "seeds": [0], "variants": {"one": {}}}
@@ -29,11 +30,11 @@ def test_the_project_has_its_sweeps() -> None:
     assert sorted(file.stem for file in CONFIGS.glob("*.yaml")) == NAMES
 
 
-@pytest.mark.parametrize("size", ["smoke", "quick", "paper"])
+@pytest.mark.parametrize("preset", ["smoke", "quick", "paper"])
 @pytest.mark.parametrize("name", NAMES)
-def test_each_sweep_has_trials_at_every_size(name: str, size) -> None:
-    sweep = sweep_of(name).at(size)
-    trials = planned(sweep, size)
+def test_each_sweep_has_trials_at_every_preset(name: str, preset) -> None:
+    sweep = sweep_of(name).at(preset)
+    trials = planned(sweep, preset)
     assert len(trials) == len(sweep.suites) * len(sweep.seeds) * len(
         sweep.search.variants() if sweep.search else sweep.variants
     )
@@ -94,9 +95,17 @@ def test_a_trained_configuration_is_known_by_all_that_trained_it(tmp_path: Path)
     assert once != evaluated(home, evaluation, ["push"])
 
 
-def test_a_size_has_its_own_budget() -> None:
-    scales = {"quick": {"suites": ["ml45"], "seeds": [3], "settings": {"training": {"iterations": 7}}}}
-    sweep = small(scales=scales, settings={"training": {"tasks_per_iteration": 2}, "method": {"sub_skills": 4}})
+def test_records_of_sweeps_that_called_a_preset_a_size_open(tmp_path: Path) -> None:
+    sweep = make(tmp_path, better)
+    text = (sweep.path / "sweep.json").read_text()
+    assert text.count('"preset": ') == text.count('"presets": ') == 1
+    (sweep.path / "sweep.json").write_text(text.replace('"preset": ', '"size": ').replace('"presets": ', '"scales": '))
+    assert SweepFolder(sweep.path).record == sweep.record
+
+
+def test_a_preset_has_its_own_budget() -> None:
+    budgets = {"quick": {"suites": ["ml45"], "seeds": [3], "settings": {"training": {"iterations": 7}}}}
+    sweep = small(presets=budgets, settings={"training": {"tasks_per_iteration": 2}, "method": {"sub_skills": 4}})
     (trial,) = planned(sweep.at("quick"), "quick")
     assert (trial.suite, trial.seed, trial.config.seed) == ("ml45", 3, 3)
     assert (trial.config.training.iterations, trial.config.training.tasks_per_iteration) == (7, 2)
@@ -131,7 +140,7 @@ def test_a_setting_that_there_is_not_is_named_with_its_place(changes: dict, told
         {"search": {"space": {"method.sub_skills": [1]}, "samples": 1}},
         {"baseline": "two"},
         {"seeds": []},
-        {"scales": {"quick": {"variants": {"two": {}}}}},
+        {"presets": {"quick": {"variants": {"two": {}}}}},
         {"suites": ["no suite"]},
         {"colour": "red"},
         {"resources": {"workers": 0}},

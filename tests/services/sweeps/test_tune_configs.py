@@ -1,4 +1,4 @@
-"""Each sweep in tune_configs, at scale smoke, as a user runs it: real Tune, real MLflow."""
+"""Each sweep in tune_configs, at preset smoke, as a user runs it: real Tune, real MLflow."""
 
 import json
 from collections.abc import Callable
@@ -47,10 +47,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def sweep(programs, runs: Path, runs_of, mlflow_file: str, joined) -> Callable[[str], tuple[dict, Run, list[Run]]]:
-    """Run one of the project's sweeps at scale smoke; return its tables and its MLflow runs."""
+    """Run one of the project's sweeps at preset smoke; return its tables and its MLflow runs."""
 
     def run(name: str) -> tuple[dict, Run, list[Run]]:
-        code, printed = programs("tune_sweep", name, "--scale", "smoke", "--name", name, "--runs", str(runs))
+        code, printed = programs("tune_sweep", name, "--preset", "smoke", "--name", name, "--runs", str(runs))
         assert code == 0, printed
         folder = runs / name
         tables = json.loads((folder / "tables" / "tables.json").read_text())

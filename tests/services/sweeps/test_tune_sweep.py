@@ -42,7 +42,7 @@ def test_a_killed_sweep_goes_on_where_it_was(
 ) -> None:
     """Finished trials stay, those under way go on from their checkpoints to the same bits, MLflow holds each once."""
     file = write_sweep({name: {"method": {"sub_skills": k}} for k, name in enumerate("abc", 1)})
-    program = programs.start("tune_sweep", file, "--scale", "smoke", "--name", "killed")
+    program = programs.start("tune_sweep", file, "--preset", "smoke", "--name", "killed")
     folder = workplace / "runs" / "killed"
 
     def one_is_over_and_the_last_under_way() -> bool:
@@ -93,7 +93,7 @@ def test_what_a_sweep_trained_is_fetched_elsewhere(programs, workplace: Path, tm
     file = write_sweep({"DMIL": {}}, settings={"training": {"iterations": 4, "checkpoint_every": 2}})
 
     def trained() -> tuple[str, bytes, str]:
-        code, printed = programs("tune_sweep", file, "--scale", "smoke", "--name", "once")
+        code, printed = programs("tune_sweep", file, "--preset", "smoke", "--name", "once")
         assert code == 0, printed
         (home,), (log,) = workplace.glob("runs/trained/*"), workplace.glob("runs/once/trials/*/log.txt")
         return newest(home).digest, (home / "metrics.json").read_bytes(), log.read_text()
@@ -140,7 +140,7 @@ def test_a_trial_that_fails_or_dies_leaves_the_others_alone(
     """One has an error, which is told; one loses its process, and is begun again; trials of two CPUs each."""
     variants = {"good": {}, "spoilt": {"training": {"learning_rate": 1e30}}}
     file = write_sweep(variants, resources={"workers": 2})
-    program = programs.start("tune_sweep", file, "--scale", "smoke", "--name", "hurt")
+    program = programs.start("tune_sweep", file, "--preset", "smoke", "--name", "hurt")
     folder = workplace / "runs" / "hurt"
     wait_for(
         lambda: program.poll() is not None or any(folder.parent.glob("trained/*/checkpoints/iteration-*")),
