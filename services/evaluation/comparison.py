@@ -33,10 +33,6 @@ DIGITS: Mapping[Metric, int] = {"success_rate": 3, "score": 2}
 """That a mean is shown to."""
 
 
-class ComparisonError(UserError):
-    """What cannot be put side by side."""
-
-
 class Place(NamedTuple):
     """What one cell is of."""
 
@@ -166,7 +162,7 @@ class Comparison:
         """The outcome of each episode.
 
         Raises:
-            ComparisonError: if a row has not as many episodes of each task and seed.
+            UserError: if a row has not as many episodes of each task and seed.
         """
         found: dict[Place, dict[int, Tried]] = defaultdict(dict)
         for contender in self.contenders:
@@ -219,8 +215,8 @@ def _tried(rows: Sequence[EpisodeResult], metric: Metric, contender: Contender) 
     return Tried(rows[0].protocol, tuple(by_task), episodes, np.array(values))
 
 
-def _other_episodes(contender: Contender, got: tuple[int, ...]) -> ComparisonError:
-    return ComparisonError(
+def _other_episodes(contender: Contender, got: tuple[int, ...]) -> UserError:
+    return UserError(
         f"{contender.folder}: got rows of {contender.row} with not as many episodes of each task and seed: "
         f"{', '.join(map(str, got))}; remove the folder, in a sweep also trials/{contender.name}/result.json, and "
         "evaluate again"

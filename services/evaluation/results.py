@@ -18,10 +18,6 @@ MOST_BYTES = 2**30
 LONGEST_LINE = 2**20
 
 
-class RowError(UserError):
-    """A line that is no whole row."""
-
-
 class _Row(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -96,7 +92,7 @@ def read_rows(path: Path, model: type[Row]) -> list[Row]:
     """Read the rows of a file of JSON lines.
 
     Raises:
-        RowError: names the file and the line that is not a row as `write_rows` writes it.
+        UserError: names the file and the line that is not a row as `write_rows` writes it.
     """
     rows = []
     for number, line in read_lines(path):
@@ -104,7 +100,7 @@ def read_rows(path: Path, model: type[Row]) -> list[Row]:
             rows.append(model.model_validate_json(line, strict=True))
         except ValidationError as error:
             got = "; ".join(explain(error, "row").splitlines())
-            raise RowError(f"{path}:{number}: {got}; wanted a whole {model.__name__}; make the file again") from error
+            raise UserError(f"{path}:{number}: {got}; wanted a whole {model.__name__}; make the file again") from error
     return rows
 
 
@@ -112,20 +108,20 @@ def read_lines(path: Path) -> Iterator[tuple[int, bytes]]:
     """Yield the lines of a file with their numbers from 1.
 
     Raises:
-        RowError: if there is no such file, it is too large or a line too long, or its last line has no end: whoever
+        UserError: if there is no such file, it is too large or a line too long, or its last line has no end: whoever
             wrote it was killed.
     """
     try:
         lines = read_file(path, MOST_BYTES).split(b"\n")
     except OSError as error:
-        raise RowError(f"{path}: got {error.strerror}; wanted a file of JSON lines; make it again") from error
+        raise UserError(f"{path}: got {error.strerror}; wanted a file of JSON lines; make it again") from error
     for number, line in enumerate(lines, start=1):
         if len(line) > LONGEST_LINE:
-            raise RowError(f"{path}:{number}: got a line of {len(line)} bytes; wanted at most {LONGEST_LINE}")
+            raise UserError(f"{path}:{number}: got a line of {len(line)} bytes; wanted at most {LONGEST_LINE}")
         if number < len(lines):
             yield number, line
         elif line:
-            raise RowError(f"{path}:{number}: got half a line; wanted a whole one; remove it or make the file again")
+            raise UserError(f"{path}:{number}: got half a line; wanted a whole one; remove it or make the file again")
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from services.evaluation.results import EpisodeResult, ImitationResult, read_row
 from services.experiments.experiment import Experiment
 from services.experiments.finished_run import FinishedRun
 from services.reporting.drawing import Picture, colour_of, drawn, panels
-from services.reporting.lineup import MOST_TASKS, MismatchError, policy_after
+from services.reporting.lineup import MOST_TASKS, policy_after
 from services.reporting.page import DataTable, Part, Prose, Section
 from services.reporting.sub_skill_pictures import marker_of
 from services.storage.files import read_file, write_file
@@ -87,7 +87,7 @@ def measure(
         episodes: of each task, the same ones for all sizes and steps.
 
     Raises:
-        MismatchError: for a task that the run does not have, or if no size of the support set is left.
+        UserError: for a task that the run does not have, or if no size of the support set is left.
     """
     plan = _planned(run, tasks, shots, steps, episodes)
     folder = run.folder / FOLDER
@@ -115,7 +115,7 @@ def _planned(
     known, own = [task for _, task in run.experiment.tasks], run.config.evaluation
     wanted = tuple(dict.fromkeys(tasks or run.experiment.suite.test_tasks[:MOST_TASKS]))
     if unknown := [task for task in wanted if task not in known]:
-        raise MismatchError(f"tasks: got {', '.join(unknown)}; wanted some of the run's, {', '.join(known)}")
+        raise UserError(f"tasks: got {', '.join(unknown)}; wanted some of the run's, {', '.join(known)}")
     sizes = _possible(run, wanted, shots)
     draws = DRAWS if DRAWS * max(sizes) <= run.config.demonstrations.held_out else 1
     evaluation = own.model_copy(
@@ -133,7 +133,7 @@ def _possible(run: FinishedRun, tasks: Sequence[str], shots: Sequence[int]) -> t
     few = min((held_out[task] for task in tasks), key=len)
     possible = tuple(sorted({size for size in shots if size < len(few) and _takes(run, few[:size])}))
     if not possible:
-        raise MismatchError(
+        raise UserError(
             f"shots: got {', '.join(map(str, shots))}; wanted a size below the {len(few)} held-out demonstrations that "
             f"{run.config.method.name} can adapt to"
         )

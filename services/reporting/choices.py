@@ -51,7 +51,7 @@ def choices_on(lineup: Lineup, task: str, shots: int, rollouts: int) -> list[Cho
         rollouts: episodes to run, those of the run's own evaluation with the same support set.
 
     Raises:
-        MismatchError: if no demonstration is left to look at.
+        UserError: if no demonstration is left to look at.
     """
     support, others = lineup.shots(task, shots)
     suite, found = lineup.experiment.suite, []

@@ -77,7 +77,7 @@ def embedding_section(lineup: Lineup, shots: int = SHOTS, perplexity: float = PE
         seed: of t-SNE.
 
     Raises:
-        MismatchError: if no demonstration is left to look at.
+        UserError: if no demonstration is left to look at.
     """
     title = "t-SNE of states by sub-skill"
     if not any(map(has_sub_skills, lineup.runs.values())):

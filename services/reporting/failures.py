@@ -36,7 +36,7 @@ def failures_of_run(finished: FinishedRun, *, videos: bool = False) -> Section:
 
     Raises:
         RenderingError: if there is nothing here to film with.
-        CameraError: if the suite names no camera to film with.
+        UserError: if the suite names no camera to film with.
         DiskFullError: for want of space for films.
     """
     title, worst = "What failed", worst_tasks(finished.episodes)

@@ -21,10 +21,6 @@ ADAPTATIONS = ("before", "after")
 """Before adaptation a policy has taken no fine-tuning step on the support set."""
 
 
-class MismatchError(UserError):
-    """Runs that cannot be shown side by side."""
-
-
 class Shots(NamedTuple):
     """A task's held-out demonstrations, as they are used."""
 
@@ -48,11 +44,11 @@ class Lineup:
         """Return the first support set of a task, and the demonstrations after it, at most so many.
 
         Raises:
-            MismatchError: if no demonstration is left to look at.
+            UserError: if no demonstration is left to look at.
         """
         held_out = self.held_out[task]
         if len(held_out) <= count:
-            raise MismatchError(
+            raise UserError(
                 f"--shots: got {count}; wanted fewer than the {len(held_out)} held-out demonstrations of {task}, so "
                 "that some are left to look at"
             )
@@ -68,7 +64,7 @@ def line_up(runs: Mapping[str, FinishedRun], tasks: Sequence[str] | None = None)
             `MOST_TASKS`, if none are named.
 
     Raises:
-        MismatchError: if the runs are of different robots, or their demonstrations made or held out otherwise.
+        UserError: if the runs are of different robots, or their demonstrations made or held out otherwise.
         UserError: for a task that there is not.
     """
     (first, run), *others = runs.items()
@@ -102,7 +98,7 @@ def _check_alike(first: str, run: FinishedRun, label: str, other: FinishedRun) -
     if differing := [field for field in settings[0] if settings[0][field] != settings[1][field]]:
         got = ", ".join(f"{field} {settings[1][field]!r}" for field in differing)
         wanted = ", ".join(repr(settings[0][field]) for field in differing)
-        raise MismatchError(f"{label}: got {got}; wanted {wanted}, as {first} has; show them on pages of their own")
+        raise UserError(f"{label}: got {got}; wanted {wanted}, as {first} has; show them on pages of their own")
 
 
 def has_sub_skills(run: FinishedRun) -> bool:

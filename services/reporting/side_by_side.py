@@ -31,7 +31,7 @@ def write_comparison(
         commands: how all of it is had again.
 
     Raises:
-        ComparisonError: if a row has not as many episodes of each task and seed.
+        UserError: if a row has not as many episodes of each task and seed.
         DiskFullError: for want of space.
     """
     sections = [

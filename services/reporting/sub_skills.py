@@ -22,7 +22,7 @@ def sub_skill_sections(lineup: Lineup, shots: int = 1, rollouts: int = 3) -> lis
         rollouts: episodes to run for each run, before adaptation and after.
 
     Raises:
-        MismatchError: if no demonstration is left to look at.
+        UserError: if no demonstration is left to look at.
     """
     if not any(map(has_sub_skills, lineup.runs.values())):
         return []

@@ -44,10 +44,6 @@ class Arguments:
     """The folder that runs are in."""
 
 
-class CameraError(UserError):
-    """A suite of whose tasks nothing can be drawn."""
-
-
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, tyro.MISSING))
@@ -106,12 +102,12 @@ def camera_of(finished: FinishedRun) -> str | View:
     """Return the camera of a run's suite.
 
     Raises:
-        CameraError: if it names none.
+        UserError: if it names none.
     """
     suite = finished.experiment.suite
     camera: str | View | None = getattr(suite, "camera", None)
     if camera is None:
-        raise CameraError(
+        raise UserError(
             f"suite: got {suite.name}, which names no camera; wanted one whose tasks can be drawn; give it a camera if "
             "its environments are MuJoCo's: docs/your-own-task.md"
         )

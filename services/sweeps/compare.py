@@ -11,9 +11,10 @@ from pathlib import Path
 
 import tyro
 
+from dmil_core.errors import UserError
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
-from services.evaluation.comparison import Comparison, ComparisonError, Contender, Place
+from services.evaluation.comparison import Comparison, Contender, Place
 from services.experiments.finished_run import FinishedRun
 from services.reporting.page import Commands
 from services.reporting.side_by_side import write_comparison
@@ -43,7 +44,7 @@ def run(arguments: Sequence[str]) -> None:
         name for name in given.names if any((place / MARK).is_file() for place in (Path(name), given.runs / name))
     ]
     if sweeps and len(given.names) > 1:
-        raise ComparisonError(f"RUN: got the sweep {sweeps[0]} with others; wanted it alone, or finished runs only")
+        raise UserError(f"RUN: got the sweep {sweeps[0]} with others; wanted it alone, or finished runs only")
     path = _of_sweep(sweeps[0], given) if sweeps else _of_runs(given)
     console.print(f"page: {path}", markup=False)
 
@@ -52,7 +53,7 @@ def _of_sweep(name: str, given: Arguments) -> Path:
     sweep = SweepFolder(find_folder(name, given.runs, MARK, "SWEEP"))
     rows = sweep.record.sweep.row_names
     if given.baseline is not None and given.baseline not in rows:
-        raise ComparisonError(f"--baseline: got {given.baseline!r}; wanted one of {', '.join(rows)}")
+        raise UserError(f"--baseline: got {given.baseline!r}; wanted one of {', '.join(rows)}")
     comparison = comparison_of(sweep, given.baseline)
     path = given.output or sweep.path / "tables" / "report.html"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -62,9 +63,7 @@ def _of_sweep(name: str, given: Arguments) -> Path:
 
 def _of_runs(given: Arguments) -> Path:
     if len(given.names) < 2:
-        raise ComparisonError(
-            f"RUN: got {' '.join(given.names) or 'none'}; wanted two finished runs or more, or one sweep"
-        )
+        raise UserError(f"RUN: got {' '.join(given.names) or 'none'}; wanted two finished runs or more, or one sweep")
     runs = [FinishedRun.found(name, given.runs) for name in given.names]
     comparison = runs_compared(runs, given.baseline)
     path = given.output or Path("comparison.html")
@@ -109,19 +108,19 @@ def runs_compared(runs: Sequence[FinishedRun], baseline: str | None = None) -> C
         baseline: a row or a run; that of the first run if none is named.
 
     Raises:
-        ComparisonError: for runs of different suites, the same run twice, or a baseline that is none of them.
+        UserError: for runs of different suites, the same run twice, or a baseline that is none of them.
     """
     names = _names(runs)
     suites = {name: run.config.suite.name for name, run in names.items()}
     if len(set(suites.values())) > 1:
         told = ", ".join(f"{name} of {suite}" for name, suite in suites.items())
-        raise ComparisonError(f"RUN: got {told}; wanted runs of one suite: rates on different tasks are no contest")
+        raise UserError(f"RUN: got {told}; wanted runs of one suite: rates on different tasks are no contest")
     rows = _rows(names)
     contenders = [_contender(row, name, names[name]) for row, own in rows.items() for name in own]
     named = baseline or next(iter(names))
     found = next((row for row, own in rows.items() if named == row or named in own), None)
     if found is None:
-        raise ComparisonError(f"--baseline: got {named!r}; wanted one of {', '.join([*rows, *names])}")
+        raise UserError(f"--baseline: got {named!r}; wanted one of {', '.join([*rows, *names])}")
     cells = [cell for run in runs for cell in run.summary.rows]
     suite = contenders[0].suite
     return Comparison(
@@ -148,7 +147,7 @@ def _names(runs: Sequence[FinishedRun]) -> dict[str, FinishedRun]:
     names = {run.name if count[run.name] == 1 else str(run.folder): run for run in runs}
     folders = Counter(run.folder.resolve() for run in runs)
     if twice := [folder for folder, times in folders.items() if times > 1]:
-        raise ComparisonError(f"RUN: got {twice[0]} twice; wanted each run once")
+        raise UserError(f"RUN: got {twice[0]} twice; wanted each run once")
     return names
 
 

@@ -31,10 +31,6 @@ DIGITS = 24
 """Of a digest, in a folder's name."""
 
 
-class SweepError(UserError):
-    """A sweep's folder that is none, or is damaged."""
-
-
 class _Record(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -79,7 +75,7 @@ class SweepFolder:
         """Open it.
 
         Raises:
-            SweepError: if it is no folder of a sweep.
+            UserError: if it is no folder of a sweep.
         """
         self.path, self.runs = path, path.parent
         self.record = _read(path / MARK, SweepRecord)
@@ -104,7 +100,7 @@ class SweepFolder:
         """Return what came of a trial, if it is over.
 
         Raises:
-            SweepError: if the record of it is damaged.
+            UserError: if the record of it is damaged.
         """
         path = self.of_trial(name) / "result.json"
         return _read(path, TrialResult) if path.exists() else None
@@ -134,6 +130,6 @@ def _read(path: Path, model: type[Record]) -> Record:
     try:
         return model.model_validate_json(read_file(path, MOST_BYTES))
     except OSError as error:
-        raise SweepError(f"{path}: got {error.strerror}; wanted a sweep's folder, as runs/NAME") from error
+        raise UserError(f"{path}: got {error.strerror}; wanted a sweep's folder, as runs/NAME") from error
     except ValidationError as error:
-        raise SweepError(f"{path}: {explain(error)}; start the sweep again, what is trained stays") from error
+        raise UserError(f"{path}: {explain(error)}; start the sweep again, what is trained stays") from error

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from services.evaluation.results import AdaptationResult, RowError, read_rows, write_rows
+from dmil_core.errors import UserError
+from services.evaluation.results import AdaptationResult, read_rows, write_rows
 
 
 @pytest.fixture
@@ -55,7 +56,7 @@ def change(path: Path, old: bytes, new: bytes) -> None:
 )
 def test_a_damaged_row_is_refused_by_file_and_line(path: Path, old: bytes, new: bytes, words: str):
     change(path, old, new)
-    with pytest.raises(RowError) as error:
+    with pytest.raises(UserError) as error:
         read_rows(path, AdaptationResult)
     assert f"{path}{words}" in str(error.value)
     assert len(str(error.value)) < 1000
@@ -63,10 +64,10 @@ def test_a_damaged_row_is_refused_by_file_and_line(path: Path, old: bytes, new: 
 
 def test_the_half_line_of_a_killed_writer_is_refused_by_its_number(path: Path):
     path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(RowError, match=r"adaptations.jsonl:3: got half a line"):
+    with pytest.raises(UserError, match=r"adaptations.jsonl:3: got half a line"):
         read_rows(path, AdaptationResult)
 
 
 def test_a_file_that_is_not_there_is_refused(tmp_path: Path):
-    with pytest.raises(RowError, match="nowhere: got No such file"):
+    with pytest.raises(UserError, match="nowhere: got No such file"):
         read_rows(tmp_path / "nowhere", AdaptationResult)

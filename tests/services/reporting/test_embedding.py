@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmil_core.demonstrations import Demonstration
+from dmil_core.errors import UserError
 from services.experiments.finished_run import FinishedRun
 from services.reporting.drawing import Picture, colour_of
 from services.reporting.embedding import embed, embedding_section, thin_out
-from services.reporting.lineup import MismatchError, line_up, policies
+from services.reporting.lineup import line_up, policies
 
 TASK = "blue-green-red"
 Trained = Callable[..., FinishedRun]
@@ -127,5 +128,5 @@ def test_few_states_get_a_perplexity_that_they_allow(trained: Trained):
 
 def test_without_sub_skills_or_demonstrations_there_is_nothing_to_draw(trained: Trained):
     assert embedding_section(line_up({"flat": trained("flat", "behaviour-cloning")})).parts == []
-    with pytest.raises(MismatchError, match="got 8; wanted fewer than the 8"):
+    with pytest.raises(UserError, match="got 8; wanted fewer than the 8"):
         embedding_section(line_up({"run": trained("run")}), shots=8)

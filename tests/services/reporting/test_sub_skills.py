@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dmil_core.errors import UserError
 from dmil_core.methods.base import FineTuning
 from services.distributed.runner import LocalRunner
 from services.evaluation.results import EpisodeResult, read_rows
@@ -14,7 +15,7 @@ from services.experiments.finished_run import FinishedRun
 from services.reporting import sub_skill_report
 from services.reporting.choices import DEMONSTRATIONS, ROLLOUTS, Choices, Timeline, choices_on
 from services.reporting.drawing import COLOURS, Picture, colour_of
-from services.reporting.lineup import MismatchError, line_up, policies
+from services.reporting.lineup import line_up, policies
 from services.reporting.page import DataTable
 from services.reporting.sub_skill_pictures import draw_timelines, draw_transitions, draw_usage, on_colour
 from services.reporting.sub_skills import sub_skill_sections
@@ -91,7 +92,7 @@ def test_what_is_adapted_to_is_not_looked_at(trained: Trained):
     held_out = [demonstration.id for demonstration in lineup.held_out[TASK]]
     assert [d.id for d in support] + [d.id for d in others] == held_out
     assert len(held_out) == 8
-    with pytest.raises(MismatchError, match="got 8; wanted fewer than the 8 held-out"):
+    with pytest.raises(UserError, match="got 8; wanted fewer than the 8 held-out"):
         lineup.shots(TASK, 8)
 
 

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dmil_core.errors import UserError
 from dmil_core.settings import sub_skills_of
 from services import report
-from services.evaluation.comparison import ComparisonError, Place
+from services.evaluation.comparison import Place
 from services.sweeps.folders import TrialResult
 from services.sweeps.table_formats import write_tables
 from services.sweeps.tables import comparison_of, tables_of
@@ -127,7 +128,7 @@ def test_seeds_with_other_episodes_are_no_one_cell(tmp_path: Path) -> None:
     sweep = make(tmp_path, better)
     file = tmp_path / "trained" / "0" / "evaluated" / "one" / "episodes.jsonl"
     file.write_text("".join(file.read_text().splitlines(keepends=True)[1:]))
-    with pytest.raises(ComparisonError, match="got rows of DMIL with not as many episodes"):
+    with pytest.raises(UserError, match="got rows of DMIL with not as many episodes"):
         tables_of(sweep)
 
 
