@@ -21,32 +21,36 @@ class Measure(NamedTuple):
     """Besides ``suite``, which all have."""
 
 
-ITERATIONS = Measure("dmil_iterations", "counter", "Iterations of meta-training done.")
-ITERATION_SECONDS = Measure("dmil_iteration_seconds", "histogram", "Time from one outer step's end to the next one's.")
+ITERATIONS = Measure("dmil_iterations", "counter", "Completed iterations of meta-training.")
+ITERATION_SECONDS = Measure(
+    "dmil_iteration_seconds", "histogram", "Time from the end of one outer step to the end of the next."
+)
 PHASE_SECONDS = Measure(
     "dmil_phase_seconds",
     "counter",
-    "Seconds of iterations by phase: broadcast, compute, waiting, reduction, step; they add up to the iterations'.",
+    "Seconds of iterations by phase: broadcast, compute, waiting, reduction, step; their sum is the iterations'.",
     ("phase",),
 )
 SLOTS_REDONE = Measure(
     "dmil_slots_redone",
     "counter",
-    "Slots given to another worker, whose own ended or was slow, or done again with iterations that a learner lost.",
+    "Slots computed again because their worker died or was slow, or because a lost learner's iterations are repeated.",
 )
 WORKERS = Measure("dmil_workers", "gauge", "Workers that are up.", ("kind",))
-WORKERS_JOINED = Measure("dmil_workers_joined", "counter", "Workers that came up, the first ones included.", ("kind",))
-WORKERS_LOST = Measure("dmil_workers_lost", "counter", "Workers that died or were ended for slowness.", ("kind",))
-EPISODES = Measure("dmil_episodes", "counter", "Episodes of evaluations.", ("split", "shots"))
-SUCCESSES = Measure("dmil_successes", "counter", "Episodes that were successes.", ("split", "shots"))
-SUCCESS_RATE = Measure(
-    "dmil_success_rate", "gauge", "Success rate of the evaluation that came to its end last.", ("split", "shots")
+WORKERS_JOINED = Measure("dmil_workers_joined", "counter", "Workers that started, including the first ones.", ("kind",))
+WORKERS_LOST = Measure(
+    "dmil_workers_lost", "counter", "Workers that died or were ended because they were slow.", ("kind",)
 )
-SPOOL_RECORDS = Measure("dmil_spool_records", "gauge", "Records that wait for MLflow on disk.")
+EPISODES = Measure("dmil_episodes", "counter", "Episodes of evaluations.", ("split", "shots"))
+SUCCESSES = Measure("dmil_successes", "counter", "Successful episodes of evaluations.", ("split", "shots"))
+SUCCESS_RATE = Measure(
+    "dmil_success_rate", "gauge", "Success rate of the evaluation that finished last.", ("split", "shots")
+)
+SPOOL_RECORDS = Measure("dmil_spool_records", "gauge", "Records on disk that wait for MLflow.")
 CHECKPOINT_TIME = Measure(
     "dmil_checkpoint_timestamp_seconds",
     "gauge",
-    "When the newest checkpoint was written, in seconds since 1970; before the first, when meta-training began.",
+    "Time of the newest checkpoint, in seconds since 1970; before the first, the start of meta-training.",
 )
 MEASURES = (
     ITERATIONS, ITERATION_SECONDS, PHASE_SECONDS, SLOTS_REDONE, WORKERS, WORKERS_JOINED, WORKERS_LOST, EPISODES,
