@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import torch
 import tyro
 
 from dmil_core.errors import RunError
-from dmil_core.networks import unflatten
+from dmil_core.methods.base import MetaLearner
 from dmil_core.outer_loop import group_gradient, tasks_of
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
@@ -49,9 +48,9 @@ def _attempt(failure: Failure, experiment: Experiment) -> Callable[[], object]:
 def _slot(failure: Failure, experiment: Experiment) -> Callable[[], object]:
     data = experiment.collect(LocalRunner(experiment.suite))
     sets = experiment.training_sets(data)
-    method, checkpoint, config = experiment.meta_learner(sets), _checkpoint(failure), failure.config
-    shapes = {name: torch.Size(shape) for name, shape in checkpoint.manifest.shapes.items()}
-    parameters = unflatten(torch.from_numpy(checkpoint.state.parameters), shapes)
+    checkpoint, config = _checkpoint(failure), failure.config
+    method, parameters = checkpoint.method(experiment.suite.action_dim), checkpoint.tensors()
+    assert isinstance(method, MetaLearner)
     iteration = int(failure.piece["iteration"])
     if checkpoint.manifest.iteration != iteration:
         raise RunError(f"{checkpoint.path}: got iteration {checkpoint.manifest.iteration}; wanted {iteration}")

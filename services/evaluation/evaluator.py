@@ -7,12 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import Demonstration
-from dmil_core.methods.base import Standardised
-from dmil_core.methods.registry import method_type
 from dmil_core.settings import sub_skills_of
 from services.cli.live_view import Tally
 from services.demonstrations.store import TaskDemonstrations
@@ -22,7 +19,7 @@ from services.distributed.runner import Runner, Simulation
 from services.evaluation.results import AdaptationResult, EpisodeResult, ImitationResult, write_rows
 from services.evaluation.summary import Evaluation, cells, rates, sub_skill_use
 from services.rollouts.adaptations import Adaptation, AdaptationOutcome, Imitation, plan_adaptations
-from services.storage.checkpoints import Checkpoint, Checkpoints
+from services.storage.checkpoints import Checkpoint, Checkpoints, iteration_of
 from services.storage.provenance import library_versions
 from services.suites.base import Split, TaskSuite
 from services.tracking import Tracker
@@ -52,7 +49,7 @@ class Tallies:
         self._meter.record(SUCCESSES, float(successes), split=adaptation.split, shots=str(adaptation.shots))
 
     def finish(self) -> None:
-        """Tell the success rates, now that all episodes are counted."""
+        """Record the success rates, now that all episodes are counted."""
         for tally in self:
             rate = tally.successes / tally.episodes
             self._meter.record(SUCCESS_RATE, rate, split=tally.split, shots=str(tally.shots))
@@ -94,8 +91,7 @@ class Evaluator:
 
         The checkpoint is not read again.
         """
-        method = self._method(checkpoint)
-        shapes = {name: torch.Size(shape) for name, shape in checkpoint.manifest.shapes.items()}
+        method, shapes = checkpoint.method(self._suite.action_dim), checkpoint.manifest.torch_shapes
         parameters = self._runner.share(checkpoint.state.parameters)
         config = self.config
         return [
@@ -147,10 +143,6 @@ class Evaluator:
             "data": self._data[adaptation.task].digest,
         }
 
-    def _method(self, checkpoint: Checkpoint) -> Standardised[Any]:
-        settings = self.config.method
-        return method_type(settings.name).restored(settings, self._suite.action_dim, checkpoint.constants)
-
 
 class Evaluations:
     """The evaluations on the way of meta-training: beside it, or in pauses of it; the rows are the same.
@@ -166,32 +158,34 @@ class Evaluations:
         Args:
             runner: does the work.
             evaluator: of the experiment.
-            checkpoints: of the run; those that wait for their evaluation are not let go. The folder ``evaluations``
-                beside theirs gets a folder for each evaluation, named by the iteration.
+            checkpoints: of the run. The folder ``evaluations`` beside theirs gets a folder for each evaluation, named
+                by the iteration.
             tracker: takes the success rates.
             overlap: evaluate beside meta-training.
         """
         self._runner, self._evaluator, self._checkpoints, self._tracker = runner, evaluator, checkpoints, tracker
         self._folder = checkpoints.folder.with_name("evaluations")
         self._overlap = overlap
-        checkpoints.spares = lambda iteration: self.is_due(iteration) and not self._is_made(iteration)
         self._under_way: tuple[Checkpoint, Simulation] | None = None
-        self.found: dict[str, Any] = {}
-        """What the last one found, as `Figures` have it: the ``success``, and ``after`` how many iterations."""
+        self.latest: dict[str, Any] = {}
+        """What the last one came to, as fields of `Figures`: the ``success``, and ``after`` how many iterations."""
 
     def is_due(self, iteration: int) -> bool:
         """Tell whether the checkpoint of an iteration is evaluated on the way; the last one is when all is over."""
         return self._evaluator.is_due(iteration)
 
-    def _is_made(self, iteration: int) -> bool:
-        return (self._folder / f"{iteration:07d}" / "episodes.jsonl").exists()
+    def pending(self) -> list[Path]:
+        """Return the checkpoints whose evaluation is due and not complete, oldest first."""
+        due = [path for path in self._checkpoints.all() if self.is_due(iteration_of(path))]
+        return [path for path in due if not (self._folder_of(iteration_of(path)) / "episodes.jsonl").exists()]
 
-    def make_up(self) -> None:
-        """Evaluate the checkpoints whose evaluation was due and dropped when the run was stopped."""
-        for path in self._checkpoints.all():
-            iteration = int(path.name.partition("-")[2])
-            if self.is_due(iteration) and not self._is_made(iteration):
-                self.begin(Checkpoint(path))
+    def _folder_of(self, iteration: int) -> Path:
+        return self._folder / f"{iteration:07d}"
+
+    def catch_up(self) -> None:
+        """Evaluate the checkpoints whose evaluation was dropped when the run was stopped."""
+        for path in self.pending():
+            self.begin(Checkpoint(path))
 
     def begin(self, checkpoint: Checkpoint) -> None:
         """Evaluate a checkpoint."""
@@ -207,7 +201,7 @@ class Evaluations:
     def _keeping_failures(self, checkpoint: Checkpoint) -> AbstractContextManager[None]:
         return keeping_failures(self._folder.parent, self._evaluator.config, lambda: checkpoint.path)
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Record the evaluation under way, if it has come to its end."""
         if self._under_way is not None and self._under_way[1].done():
             self.finish()
@@ -223,16 +217,16 @@ class Evaluations:
     def _record(self, checkpoint: Checkpoint, outcomes: Sequence[AdaptationOutcome]) -> None:
         iteration = checkpoint.manifest.iteration
         evaluation = self._evaluator.evaluation(checkpoint, outcomes)
-        write_evaluation(evaluation, self._folder / f"{iteration:07d}")
+        write_evaluation(evaluation, self._folder_of(iteration))
         tallies = Tallies(self._runner.meter)
         for adaptation, outcome in zip(self._evaluator.adaptations, outcomes, strict=True):
             tallies.add(adaptation, outcome)
         tallies.finish()
-        self.found = {"success": list(tallies), "after": iteration}
+        self.latest = {"success": list(tallies), "after": iteration}
         found = cells(evaluation.episodes, evaluation.best_score, self._evaluator.config.method)
         self._tracker.metrics(iteration, rates(found, sub_skill_use(evaluation.adaptations)))
-        in_words = "; ".join(f"{cell.split} {cell.shots}-shot {cell.success_rate:.3f}" for cell in found)
-        logger.info(f"success rates after {iteration} iterations: {in_words}")
+        success_rates = "; ".join(f"{cell.split} {cell.shots}-shot {cell.success_rate:.3f}" for cell in found)
+        logger.info(f"success rates after {iteration} iterations: {success_rates}")
 
 
 def write_evaluation(evaluation: Evaluation, folder: Path) -> None:

@@ -1,22 +1,16 @@
 """One experiment, put together from its config once, for all programs: collect, meta-train, evaluate."""
 
-import logging
-import time
-from collections import deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-import torch
-
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import Demonstration
-from dmil_core.errors import RunError, UserError
+from dmil_core.errors import UserError
 from dmil_core.methods.base import MetaLearner, Method, PractisingLearner, Standardised
 from dmil_core.methods.registry import method_type
-from dmil_core.networks import Parameters, flatten, unflatten
+from dmil_core.networks import Parameters, flatten
 from dmil_core.outer_loop import OuterState
 from dmil_core.seeding import stream
 from services.cli.live_view import Figures
@@ -24,12 +18,11 @@ from services.cli.progress import Bar
 from services.demonstrations.collection import DemonstrationCollection
 from services.demonstrations.store import DemoStore, TaskDemonstrations
 from services.distributed.failures import keeping_failures
-from services.distributed.metrics import CHECKPOINT_TIME, SPOOL_RECORDS
 from services.distributed.ray_runner import RayRunner
 from services.distributed.runner import LocalRunner, Plan, Runner
 from services.evaluation.evaluator import Evaluations, Evaluator, Tallies, write_evaluation
-from services.evaluation.summary import AGAINST_COLLAPSE, COLLAPSED, Evaluation
-from services.experiments.iteration_metrics import figures_of, iteration_metrics, nonfinite_in_words, shares_of
+from services.evaluation.summary import Evaluation
+from services.experiments.meta_training import CheckpointWriter, IterationLog, meta_train
 from services.rollouts.adaptations import AdaptationOutcome
 from services.storage.checkpoints import Checkpoint, CheckpointError, Checkpoints, Manifest
 from services.storage.provenance import library_versions
@@ -37,14 +30,8 @@ from services.suites.base import Split, TaskSuite
 from services.suites.registry import open_suite
 from services.tracking import Tracker
 
-logger = logging.getLogger(__name__)
-
 RunnerKind = Literal["ray", "local"]
 OnNonfinite = Literal["stop", "skip"]
-RECENT = 50
-"""So many iterations are behind the losses and the use of sub-skills on the screen."""
-COLLAPSED_ITERATIONS = 100
-"""So long may one sub-skill take nearly all states before a warning."""
 
 
 @contextmanager
@@ -61,38 +48,6 @@ def open_runner(kind: RunnerKind, suite: TaskSuite, workers: int | None) -> Iter
         yield runner
     finally:
         runner.close()
-
-
-class NonFiniteError(RunError):
-    """A loss or a gradient that is not finite."""
-
-    def __init__(self, told: str, folder: Path) -> None:
-        """Say what is to be done about it."""
-        super().__init__(
-            f"{told}; the step is not taken, the state before it is checkpointed; look at these demonstrations, or go "
-            f"on without such steps: python -m services.meta_train --resume {folder} --on-nonfinite skip"
-        )
-
-
-class CollapseWatch:
-    """Notices that one sub-skill takes nearly all states for long, and says so once."""
-
-    def __init__(self) -> None:
-        """Nothing is noticed yet."""
-        self._iterations, self._told = 0, False
-
-    def look(self, iteration: int, metrics: Mapping[str, float]) -> str | None:
-        """Return the warning, when it is due after an iteration with these metrics."""
-        shares = shares_of(metrics)
-        collapsed = len(shares) > 1 and shares.max() > COLLAPSED
-        self._iterations = self._iterations + 1 if collapsed else 0
-        if self._told or self._iterations < COLLAPSED_ITERATIONS:
-            return None
-        self._told = True
-        return (
-            f"sub-skill {shares.argmax()} has taken over {COLLAPSED:.0%} of the states for {COLLAPSED_ITERATIONS} "
-            f"iterations, up to {iteration}: the hierarchy is not used; {AGAINST_COLLAPSE}"
-        )
 
 
 class Experiment:
@@ -154,12 +109,6 @@ class Experiment:
         settings, demonstrations = self.config.method, [d for task in training_sets.values() for d in task]
         return method_type(settings.name).prepared(settings, self.suite.action_dim, demonstrations)
 
-    def meta_learner(self, training_sets: Mapping[str, Sequence[Demonstration]]) -> MetaLearner[Any]:
-        """Return the method, as one that is meta-trained."""
-        method = self.method(training_sets)
-        assert isinstance(method, MetaLearner)
-        return method
-
     def initial_parameters(self, method: Method) -> Parameters:
         """Draw the parameters that meta-training starts from."""
         return method.initial_parameters(stream(self.config.seed, "initial parameters"))
@@ -177,8 +126,8 @@ class Experiment:
     ) -> Checkpoint:
         """Meta-train to the set number of iterations and return the last checkpoint.
 
-        Stopped by Ctrl-C, SIGTERM or a fault, it writes a checkpoint first, and drops an evaluation that is under way;
-        who resumes makes that up.
+        Stopped by Ctrl-C, SIGTERM or a fault, it writes a checkpoint first, and drops an evaluation that is under way,
+        which a resumed run catches up on.
 
         Args:
             runner: does the work.
@@ -194,104 +143,41 @@ class Experiment:
             CheckpointError: if the checkpoint to go on from was trained on other demonstrations.
             RunError: where numbers are not finite, or for an error in a slot, which is named.
         """
-        settings = self.config.training
         sets = self.training_sets(data)
         method = self.method(sets)
-        initial = self.initial_parameters(method)
-        shapes = {name: tensor.shape for name, tensor in initial.items()}
-        digests = {task: dataset.digest for task, dataset in data.items()}
-        _same_data(resume, digests, self.store)
-        state = OuterState.start(flatten(initial).numpy()) if resume is None else resume.state
-        environment_steps = 0 if resume is None else resume.manifest.environment_steps
-
-        def save(state: OuterState, loss: float | None) -> Path:
-            parameters = unflatten(torch.tensor(state.parameters), shapes)
-            manifest = Manifest(
-                iteration=state.iteration,
-                loss=loss,
-                config=self.config,
-                shapes={name: tuple(shape) for name, shape in shapes.items()},
-                environment_steps=environment_steps,
-                data=digests,
-                versions=library_versions(),
-                mlflow_run_id=tracker.identify(patience=20.0 if state.iteration == settings.iterations else 0.0),
-            )
-            arrays = {name: tensor.numpy() for name, tensor in parameters.items()}
-            path = checkpoints.save(state, arrays, method.constants(), manifest)
-            runner.meter.record(CHECKPOINT_TIME, time.time())
-            logger.info(f"checkpoint: {path}")
-            return path
-
         evaluations = Evaluations(
-            runner,
-            self.evaluator(runner, data),
-            checkpoints,
-            tracker,
-            overlap=overlap_evaluation,
+            runner, self.evaluator(runner, data), checkpoints, tracker, overlap=overlap_evaluation
         )
-        evaluations.make_up()
-        if state.iteration >= settings.iterations:
+        if resume is None:
+            initial = self.initial_parameters(method)
+            state, manifest = OuterState.start(flatten(initial).numpy()), self._manifest(initial, data)
+        else:
+            _same_data(resume, data, self.store)
+            changed = {"config": self.config, "versions": library_versions()}
+            state, manifest = resume.state, resume.manifest.model_copy(update=changed)
+        writer = CheckpointWriter(checkpoints, manifest, method.constants(), runner, tracker, evaluations.pending)
+        evaluations.catch_up()
+        if state.iteration >= self.config.training.iterations:
             evaluations.finish()
-            return resume or Checkpoint(save(state, None))
+            return resume or Checkpoint(writer.write(state))
         assert isinstance(method, MetaLearner)
-        skip = on_nonfinite == "skip"
         suite = self.suite if isinstance(method, PractisingLearner) else None  # takes a worker seconds to import
-        plan = Plan(method, shapes, sets, state, settings, self.config.seed, skip, suite)
-        training = runner.meta_train(plan)
-        collapse = CollapseWatch()
-        losses: list[float] = []
-        recent: deque[Mapping[str, float]] = deque(maxlen=RECENT)
-        path, saved = None, -1
+        skip, seed = on_nonfinite == "skip", self.config.seed
+        plan = Plan(method, manifest.torch_shapes, sets, state, self.config.training, seed, skip, suite)
+        log = IterationLog(runner, tracker, evaluations)
+        return Checkpoint(meta_train(runner, plan, writer, log, evaluations))
 
-        def figures() -> Figures:
-            return figures_of(list(recent))._replace(**evaluations.found, workers=runner.worker_counts)
-
-        def save_now() -> Path | None:
-            state = training.state()
-            if state.iteration == saved:
-                return path
-            return save(state, float(np.mean(losses)) if losses else None)
-
-        try:
-            runner.meter.record(CHECKPOINT_TIME, time.time())
-            with (
-                Bar("meta-training", settings.iterations, state.iteration, "iterations", figures) as bar,
-                keeping_failures(checkpoints.folder.parent, self.config, save_now),
-            ):
-                for iteration in training.iterations(settings.iterations - state.iteration):
-                    done = iteration.number
-                    metrics = iteration_metrics(iteration)
-                    environment_steps += int(metrics.get("environment_steps", 0))
-                    if not iteration.stepped:
-                        told = nonfinite_in_words(iteration)
-                        if on_nonfinite == "stop":
-                            save_now()
-                            raise NonFiniteError(told, checkpoints.folder.parent)
-                        logger.warning(f"{told}; the step is not taken")
-                    else:
-                        losses.append(metrics["loss"])
-                    tracker.metrics(done, {name: value for name, value in metrics.items() if np.isfinite(value)})
-                    runner.meter.record(SPOOL_RECORDS, float(tracker.waiting))
-                    recent.append(metrics)
-                    bar.advance(1)
-                    if warning := collapse.look(done, metrics):
-                        logger.warning(warning)
-                        tracker.tags({"warning.collapse": warning})
-                    evaluations.look()
-                    last = done == settings.iterations
-                    if done % settings.checkpoint_every == 0 or last:
-                        path, saved = save(training.state(), float(np.mean(losses)) if losses else None), done
-                        losses.clear()
-                        if evaluations.is_due(done):
-                            evaluations.begin(Checkpoint(path))
-                evaluations.finish()
-            assert path is not None
-            return Checkpoint(path)
-        except KeyboardInterrupt:
-            save_now()
-            raise
-        finally:
-            training.close()
+    def _manifest(self, initial: Parameters, data: Mapping[str, TaskDemonstrations]) -> Manifest:
+        """Return the manifest of the state before the first iteration."""
+        return Manifest(
+            iteration=0,
+            loss=None,
+            config=self.config,
+            shapes={name: tuple(tensor.shape) for name, tensor in initial.items()},
+            data=_digests(data),
+            versions=library_versions(),
+            mlflow_run_id=None,
+        )
 
     # Evaluation
 
@@ -342,14 +228,19 @@ class Experiment:
         return Evaluator(runner, self.config, self.suite, tasks, data, self.held_out_sets(data))
 
 
-def _same_data(resume: Checkpoint | None, digests: Mapping[str, str], store: DemoStore) -> None:
+def _digests(data: Mapping[str, TaskDemonstrations]) -> dict[str, str]:
+    return {task: dataset.digest for task, dataset in data.items()}
+
+
+def _same_data(resume: Checkpoint, data: Mapping[str, TaskDemonstrations], store: DemoStore) -> None:
     """Refuse to go on with other demonstrations.
 
     Raises:
         CheckpointError: names the tasks whose demonstrations differ.
     """
-    if resume is not None and resume.manifest.data != digests:
-        changed = [task for task in digests if resume.manifest.data.get(task) != digests[task]]
+    before = resume.manifest.data
+    if before != _digests(data):
+        changed = [task for task, dataset in data.items() if before.get(task) != dataset.digest]
         raise CheckpointError(
             f"{resume.path}: trained on other demonstrations of {', '.join(changed)} than the store {store.root} "
             "holds; point DMIL_DATA to those it was trained on"

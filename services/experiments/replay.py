@@ -11,8 +11,6 @@ import torch
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import UserError
 from dmil_core.methods.base import FineTuning, Policy
-from dmil_core.methods.registry import method_type
-from dmil_core.networks import unflatten
 from services.evaluation.results import EpisodeResult
 from services.experiments.finished_run import FinishedRun
 from services.rollouts.recording import Film, Footage, Watched, watch, watch_expert
@@ -107,16 +105,15 @@ class Replay:
 
     def _policy(self, row: EpisodeResult) -> Policy:
         run = self.run
-        checkpoint, settings = run.checkpoint, run.config.method
+        checkpoint = run.checkpoint
         if checkpoint.digest != row.checkpoint:
             raise ReplayError(
                 f"{checkpoint.path}: got the digest {checkpoint.digest[:12]}; the episodes are of "
                 f"{row.checkpoint[:12]}; evaluate the run's end: python -m services.meta_train --resume {run.folder}"
             )
-        shapes = {name: torch.Size(shape) for name, shape in checkpoint.manifest.shapes.items()}
-        parameters = unflatten(torch.tensor(checkpoint.state.parameters), shapes)
-        method = method_type(settings.name).restored(settings, run.experiment.suite.action_dim, checkpoint.constants)
-        return method.adapt(parameters, self._support(row), FineTuning(row.fine_tuning_steps, row.learning_rate))
+        method = checkpoint.method(run.experiment.suite.action_dim)
+        fine_tuning = FineTuning(row.fine_tuning_steps, row.learning_rate)
+        return method.adapt(checkpoint.tensors(), self._support(row), fine_tuning)
 
     def _support(self, row: EpisodeResult) -> Sequence[Demonstration]:
         data = self.run.demonstrations[row.task]

@@ -2,14 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
-
-import torch
+from typing import NamedTuple
 
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import UserError
-from dmil_core.methods.base import FineTuning, Policy, Standardised
-from dmil_core.methods.registry import method_type
+from dmil_core.methods.base import FineTuning, Policy
 from dmil_core.settings import sub_skills_of
 from services.distributed.runner import LocalRunner
 from services.experiments.experiment import Experiment
@@ -114,12 +111,8 @@ def policy_after(run: FinishedRun, support: Sequence[Demonstration], steps: int)
         support: demonstrations of one task.
         steps: of fine-tuning.
     """
-    settings, evaluation = run.config.method, run.config.evaluation
-    method: Standardised[Any] = method_type(settings.name).restored(
-        settings, run.experiment.suite.action_dim, run.checkpoint.constants
-    )
-    parameters = {name: torch.from_numpy(array) for name, array in run.checkpoint.parameters.items()}
-    return method.adapt(parameters, support, FineTuning(steps, evaluation.learning_rate))
+    method = run.checkpoint.method(run.experiment.suite.action_dim)
+    return method.adapt(run.checkpoint.tensors(), support, FineTuning(steps, run.config.evaluation.learning_rate))
 
 
 def policies(run: FinishedRun, support: Sequence[Demonstration]) -> dict[str, Policy]:

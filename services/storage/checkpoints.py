@@ -5,9 +5,9 @@ import logging
 import math
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -17,7 +17,9 @@ from safetensors.numpy import load, save
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import UserError, explain, shown
-from dmil_core.networks import flatten
+from dmil_core.methods.base import Standardised
+from dmil_core.methods.registry import method_type
+from dmil_core.networks import Parameters, flatten, unflatten
 from dmil_core.outer_loop import OuterState
 from services.storage.checksums import checked_file, listing, sha256
 from services.storage.files import inside, read_file, room_for, sync
@@ -87,6 +89,11 @@ class Manifest(BaseModel):
         return sum(map(math.prod, self.shapes.values()))
 
     @property
+    def torch_shapes(self) -> dict[str, torch.Size]:
+        """The same as `shapes`, as torch has them."""
+        return {name: torch.Size(shape) for name, shape in self.shapes.items()}
+
+    @property
     def digest(self) -> str:
         """What a result row names the checkpoint by.
 
@@ -147,6 +154,20 @@ class Checkpoint:
             self.manifest.iteration, flat, **{name: array.copy() for name, array in self._moments.items()}
         )
 
+    def tensors(self) -> Parameters:
+        """Return the parameters, a new copy each time, laid out as in meta-training."""
+        return unflatten(torch.from_numpy(self.state.parameters), self.manifest.torch_shapes)
+
+    def method(self, action_dim: int) -> Standardised[Any]:
+        """Return the method that the parameters are of, for actions of so many numbers."""
+        settings = self.manifest.config.method
+        return method_type(settings.name).restored(settings, action_dim, self.constants)
+
+
+def iteration_of(path: Path) -> int:
+    """Return the iteration that the folder of a checkpoint is named by."""
+    return int(path.name.partition("-")[2])
+
 
 class Checkpoints:
     """The checkpoints of one run, in its folder ``checkpoints``."""
@@ -155,8 +176,6 @@ class Checkpoints:
         """Keep the newest `kept` checkpoints, and the best besides."""
         self.folder = folder
         self.kept = kept
-        self.spares: Callable[[int], bool] = lambda iteration: False
-        """Tells by its iteration whether a checkpoint is still needed, and so not let go."""
 
     def all(self) -> list[Path]:
         """Return the checkpoints' folders, oldest first."""
@@ -192,19 +211,26 @@ class Checkpoints:
     def save(
         self,
         state: OuterState,
-        parameters: Mapping[str, np.ndarray],
         constants: Mapping[str, np.ndarray],
         manifest: Manifest,
+        needed: Collection[Path] = (),
     ) -> Path:
-        """Write a checkpoint beside, sync it, rename it, and let go of those that are no longer kept.
+        """Write a checkpoint beside, sync it, rename it, and remove those that are no longer kept.
+
+        Args:
+            state: of the learner.
+            constants: what the method learned once from the data.
+            manifest: of this state.
+            needed: older checkpoints that stay too.
 
         Raises:
             DiskFullError: for want of space; what was written by then is removed.
         """
         path = self.folder / f"iteration-{state.iteration:07d}"
         writing = self.folder / f".writing-{os.getpid()}"
+        parameters = unflatten(torch.from_numpy(state.parameters), manifest.torch_shapes)
         contents: dict[str, Mapping[str, np.ndarray]] = {
-            PARAMETERS: parameters,
+            PARAMETERS: {name: tensor.numpy() for name, tensor in parameters.items()},
             OPTIMISER: {"first_moment": state.first_moment, "second_moment": state.second_moment},
             CONSTANTS: constants,
         }
@@ -229,10 +255,10 @@ class Checkpoints:
                 sync(self.folder)
         finally:
             shutil.rmtree(writing, ignore_errors=True)
-        self._let_go()
+        self._prune(needed)
         return path
 
-    def best(self) -> Path | None:
+    def _best(self) -> Path | None:
         """Return the checkpoint with the least loss, of those that are not damaged."""
         scored = {path: loss for path, loss in self._sound().items() if loss is not None and math.isfinite(loss)}
         return min(scored, key=lambda path: scored[path]) if scored else None
@@ -247,12 +273,11 @@ class Checkpoints:
                 continue
         return found
 
-    def _let_go(self) -> None:
+    def _prune(self, needed: Collection[Path]) -> None:
         """Remove what is older than the newest `kept` whole checkpoints, damaged ones too, but not the best."""
-        whole, best = list(self._sound()), self.best()
+        whole, best = list(self._sound()), self._best()
         for path in self.all() if len(whole) > self.kept else []:
-            needed = path == best or path.is_symlink() or self.spares(int(path.name.partition("-")[2]))
-            if path < whole[-self.kept] and not needed:
+            if path < whole[-self.kept] and path != best and path not in needed and not path.is_symlink():
                 shutil.rmtree(path)
 
 

@@ -10,14 +10,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch
 from mlflow.models import set_model
 from mlflow.pyfunc.model import PythonModel, PythonModelContext
 
 from dmil_core.demonstrations import Demonstration, digest
 from dmil_core.errors import RunError
 from dmil_core.methods.base import FineTuning, Policy
-from dmil_core.methods.registry import method_type
 from services.storage.checkpoints import Checkpoint
 from services.tracking.packing import unpacked
 
@@ -31,11 +29,9 @@ class Imitator(PythonModel):
     def load_context(self, context: PythonModelContext) -> None:
         """Read the checkpoint."""
         checkpoint = Checkpoint(Path(context.artifacts["checkpoint"]))
-        config = checkpoint.manifest.config
         self._action_dim: int = context.model_config["action_dim"]
-        self._method = method_type(config.method.name).restored(config.method, self._action_dim, checkpoint.constants)
-        self._parameters = {name: torch.tensor(array) for name, array in checkpoint.parameters.items()}
-        self._evaluation = config.evaluation
+        self._method, self._parameters = checkpoint.method(self._action_dim), checkpoint.tensors()
+        self._evaluation = checkpoint.manifest.config.evaluation
         self.policies: dict[tuple[str, FineTuning], Policy] = {}
 
     def predict(  # pyright: ignore[reportIncompatibleMethodOverride]  MLflow's own is said to return nothing

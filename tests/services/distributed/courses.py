@@ -8,6 +8,7 @@ import numpy as np
 import ray
 
 from dmil_core.configs import ExperimentConfig
+from dmil_core.methods.base import MetaLearner
 from dmil_core.networks import flatten
 from dmil_core.outer_loop import OuterState
 from services.distributed.runner import MetaTraining, Plan
@@ -24,7 +25,8 @@ def training(config: ExperimentConfig, slots: int, group: int) -> ExperimentConf
 def plan_of(experiment: Experiment, data) -> Plan:
     config = experiment.config
     sets = experiment.training_sets(data)
-    method = experiment.meta_learner(sets)
+    method = experiment.method(sets)
+    assert isinstance(method, MetaLearner)
     initial = experiment.initial_parameters(method)
     shapes = {name: tensor.shape for name, tensor in initial.items()}
     return Plan(

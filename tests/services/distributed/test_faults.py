@@ -24,7 +24,8 @@ from services.distributed.failures import read_failure
 from services.distributed.ray_meta_training import RayMetaTraining
 from services.distributed.runner import LocalRunner
 from services.distributed.simulation_worker import SimulationWorker
-from services.experiments.experiment import CollapseWatch, Experiment, open_runner
+from services.experiments.experiment import Experiment, open_runner
+from services.experiments.meta_training import CollapseWatch
 from services.storage.checkpoints import Checkpoints
 from services.suites.base import Attempt
 from tests.services.distributed.courses import ITERATIONS, alone, assert_same_bits, follow, pid_of, plan_of, training
@@ -347,18 +348,18 @@ def test_a_run_may_go_on_without_the_steps_that_are_not_finite(train, capsys: py
 def test_a_collapse_is_told_once_when_it_has_lasted():
     watch = CollapseWatch()
 
-    def look(number: int, share: float) -> str | None:
-        return watch.look(number, {"sub_skill_share/0": share, "sub_skill_share/1": 1 - share, "agreement": 1.0})
+    def update(number: int, share: float) -> str | None:
+        return watch.update(number, {"sub_skill_share/0": share, "sub_skill_share/1": 1 - share, "agreement": 1.0})
 
-    assert [look(number, 0.995) for number in range(99)] == [None] * 99
-    assert look(99, 0.6) is None
-    assert [look(number, 0.001) for number in range(100, 199)] == [None] * 99
-    told = look(199, 0.001)
+    assert [update(number, 0.995) for number in range(99)] == [None] * 99
+    assert update(99, 0.6) is None
+    assert [update(number, 0.001) for number in range(100, 199)] == [None] * 99
+    told = update(199, 0.001)
     assert told is not None
     assert "sub-skill 1 has taken over 99% of the states for 100 iterations, up to 199" in told
     assert "--training.learning-rate" in told
-    assert look(200, 0.001) is None
-    assert all(CollapseWatch().look(number, {"sub_skill_share/0": 1.0}) is None for number in range(150))
+    assert update(200, 0.001) is None
+    assert all(CollapseWatch().update(number, {"sub_skill_share/0": 1.0}) is None for number in range(150))
 
 
 # Evaluations on the way

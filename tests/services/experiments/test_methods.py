@@ -117,7 +117,8 @@ def test_a_slot_is_a_pure_function(store: DemoStore, data, method: str):
     plan = plan_of(experiment, data)
     sets = experiment.training_sets(data)
     parameters = unflatten(torch.tensor(plan.state.parameters), plan.shapes)
-    learner = experiment.meta_learner(sets)
+    learner = experiment.method(sets)
+    assert isinstance(learner, MetaLearner)
     found = []
     for _ in range(2):
         material = learner.sample(sets["push"], 0, stream(3, "batch"))

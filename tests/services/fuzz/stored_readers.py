@@ -31,14 +31,13 @@ class CheckpointReader:
     def __init__(self, folder: Path) -> None:
         self.named = "iteration-0000004"
         generator = np.random.default_rng(0)
-        parameters = {n: generator.normal(size=s).astype(np.float32) for n, s in self.SHAPES.items()}
         size = sum(map(math.prod, self.SHAPES.values()))
         state = OuterState(4, *generator.normal(size=(3, size)).astype(np.float32))
         manifest = Manifest(
             iteration=4, loss=0.5, config=PRESETS["ml10-smoke"], shapes=self.SHAPES, data={"reach": "0" * 64},
             versions={"torch": "2"}, mlflow_run_id="run",
         )  # fmt: skip
-        self.path = Checkpoints(folder, kept=1).save(state, parameters, {"mean": np.ones(2, np.float32)}, manifest)
+        self.path = Checkpoints(folder, kept=1).save(state, {"mean": np.ones(2, np.float32)}, manifest)
         self.files = {path.name: path.read_bytes() for path in self.path.iterdir()}
         self.real = Checkpoint(self.path)
         self.outside = folder / "outside"

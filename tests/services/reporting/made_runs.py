@@ -48,9 +48,8 @@ def make_run(
     manifest = Manifest(
         iteration=len(metrics), loss=None, config=config, shapes={"one": (1,)}, data={}, versions={}, mlflow_run_id=None
     )
-    one = {"one": np.zeros(1, np.float32)}
-    state = OuterState.start(one["one"])._replace(iteration=len(metrics))
-    checkpoint = Checkpoint(Checkpoints(folder / "checkpoints", 1).save(state, one, {}, manifest))
+    state = OuterState.start(np.zeros(1, np.float32))._replace(iteration=len(metrics))
+    checkpoint = Checkpoint(Checkpoints(folder / "checkpoints", 1).save(state, {}, manifest))
     common = {
         "suite": config.suite.name, "protocol": protocol, "method": config.method.name, "draw": 0, "support": ("d",),
         "checkpoint": checkpoint.digest, "data": "s", "fine_tuning_steps": 1, "learning_rate": 0.1, "versions": {},

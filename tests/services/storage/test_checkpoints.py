@@ -10,10 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import safetensors.numpy
-import torch
 
 from dmil_core.configs import ExperimentConfig, TrainingConfig
-from dmil_core.networks import unflatten
 from dmil_core.outer_loop import OuterState, OuterStep, add
 from services.storage.checkpoints import Checkpoint, CheckpointError, Checkpoints, Manifest
 from services.storage.files import DiskFullError
@@ -39,8 +37,6 @@ def start() -> OuterState:
 
 
 def save(checkpoints: Checkpoints, state: OuterState, loss: float | None = None) -> Path:
-    shapes = {name: torch.Size(shape) for name, shape in SHAPES.items()}
-    parameters = {name: t.numpy() for name, t in unflatten(torch.tensor(state.parameters), shapes).items()}
     manifest = Manifest(
         iteration=state.iteration,
         loss=loss,
@@ -50,7 +46,7 @@ def save(checkpoints: Checkpoints, state: OuterState, loss: float | None = None)
         versions={"torch": "2"},
         mlflow_run_id="run",
     )
-    return checkpoints.save(state, parameters, {"observation_mean": np.arange(2, dtype=np.float32)}, manifest)
+    return checkpoints.save(state, {"observation_mean": np.arange(2, dtype=np.float32)}, manifest)
 
 
 def same(one: OuterState, other: OuterState) -> bool:
@@ -130,9 +126,6 @@ def test_the_newest_and_the_best_are_kept(tmp_path: Path):
         save(checkpoints, start()._replace(iteration=iteration), loss)
     assert [path.name for path in checkpoints.all()] == [f"iteration-{i:07d}" for i in (4, 10, 12)]
     assert checkpoints.newest().manifest.iteration == 12
-    best = checkpoints.best()
-    assert best is not None
-    assert Checkpoint(best).manifest.iteration == 4
 
 
 def test_saving_the_same_iteration_again_replaces_it(tmp_path: Path):
@@ -197,7 +190,6 @@ def test_a_damaged_checkpoint_does_not_count_as_kept_or_best(tmp_path: Path):
     (paths[2] / "manifest.json").write_text("{")
     save(checkpoints, start()._replace(iteration=4), float("nan"))
     assert [path.name[-1] for path in checkpoints.all()] == ["2", "3", "4"]
-    assert checkpoints.best() == paths[1]
     save(checkpoints, start()._replace(iteration=5))
     assert [path.name[-1] for path in checkpoints.all()] == ["2", "4", "5"], "a damaged one goes with those of its age"
 
