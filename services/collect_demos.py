@@ -17,8 +17,8 @@ from rich.table import Table
 
 from dmil_core.configs import ExperimentConfig
 from services import inspect_demos, record_demos, verify_experts
-from services.cli.arguments import Quiet, exit_code, parse
-from services.cli.composition import DEFAULT_PRESET, defaults_from
+from services.cli.arguments import Quiet, exit_code, parse, peek
+from services.cli.composition import DEFAULT_PRESET, EARLY, defaults_from
 from services.cli.progress import Clock, console
 from services.demonstrations.store import TaskDemonstrations, open_store
 from services.experiments.experiment import Experiment, RunnerKind, open_runner
@@ -52,7 +52,7 @@ def run(arguments: Sequence[str]) -> None:
     if arguments and arguments[0] in OTHERS:
         OTHERS[arguments[0]](arguments[1:])
         return
-    given = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(arguments)))
+    given = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(peek(arguments, **EARLY))))
     store = open_store()
     experiment = Experiment(given.experiment, store)
     clock = Clock()

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from dmil_core.configs import DEFAULT_METHOD, ExperimentConfig
 from dmil_core.errors import UserError, explain
 from services.cli.arguments import Quiet, exit_code, parse, peek
-from services.cli.composition import DEFAULT_PRESET, defaults_from
+from services.cli.composition import DEFAULT_PRESET, EARLY, defaults_from
 from services.cli.progress import Clock, console
 from services.demonstrations.store import open_store
 from services.evaluation.summary import summarise
@@ -130,15 +130,15 @@ def _carry_out(given: Arguments, folder: Path, checkpoint: Checkpoint | None) ->
 
 def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]:
     """Return the arguments, the run's folder, and the checkpoint to go on from."""
-    early = peek(arguments, resume=str, runs=Path, preset=str, config=Path, suite=str, method=str, demos=str)
+    early = peek(arguments, **EARLY, resume=str, runs=Path)
     if early.resume is None:
-        given = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(arguments)))
+        given = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(early)))
         config = given.experiment
         named = "" if config.method.name == DEFAULT_METHOD else f"{config.method.name}-"
         kind = f"{config.suite.name}-{named}{given.preset.rpartition('-')[2]}"
         folder = new_folder(given.name or f"{kind}-{datetime.now():%Y%m%d-%H%M%S}", given.runs, MARK)
         return given, folder, None
-    if early.preset or early.config or early.suite or early.method or early.demos:
+    if any(getattr(early, name) for name in EARLY):
         raise UserError(
             "--resume: got --preset, --config, --suite, --method or --demos with it; wanted none: a run goes on with "
             "its own settings"

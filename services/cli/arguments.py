@@ -33,8 +33,13 @@ PROGRAMS = {
 }
 
 
-def peek(arguments: Sequence[str], **options: Any) -> argparse.Namespace:
-    """Return the few options that decide the defaults of all others: each of `options` is its type."""
+def peek(arguments: Sequence[str], **options: Callable[[str], Any]) -> argparse.Namespace:
+    """Return some of the options, which decide the defaults of all others.
+
+    Args:
+        arguments: of the command line.
+        **options: the type of each.
+    """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name, kind in options.items():
         parser.add_argument(f"--{name}", type=kind)

@@ -1,5 +1,6 @@
 """An experiment's settings put together from a preset, a YAML file and the options that decide their defaults."""
 
+from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,28 +18,24 @@ from dmil_core.configs import (
 )
 from dmil_core.errors import UserError, explain, shown
 from dmil_core.methods.registry import MethodError
-from services.cli.arguments import peek
 from services.cli.yaml_files import merged, read_yaml
 
 DEFAULT_SUITE, DEFAULT_PRESET = "ml10", "quick"
+EARLY = {"preset": str, "suite": str, "method": str, "config": Path, "demos": str}
+"""The options, with their types, that decide the defaults of all other settings."""
 
 
-def defaults_from(arguments: Sequence[str]) -> ExperimentConfig:
-    """Return what ``--preset``, ``--suite``, ``--method``, ``--config`` and ``--demos`` say all other settings are.
+def defaults_from(early: Namespace) -> ExperimentConfig:
+    """Return the settings that the early options ask for; see `EARLY`.
 
     Raises:
         UserError: as `config_from`.
     """
-    early = peek(arguments, preset=str, suite=str, method=str, config=Path, demos=str)
-    config = config_from(early.preset or DEFAULT_PRESET, early.config, early.suite, early.method)
-    if early.demos is None:
-        return config
-    demonstrations = config.demonstrations.model_copy(update={"source": early.demos})
-    return config.model_copy(update={"demonstrations": demonstrations})
+    return config_from(early.preset or DEFAULT_PRESET, early.config, early.suite, early.method, early.demos)
 
 
 def config_from(
-    preset: str, file: Path | None, suite: str | None = None, method: str | None = None
+    preset: str, file: Path | None, suite: str | None = None, method: str | None = None, demos: str | None = None
 ) -> ExperimentConfig:
     """Return a preset's settings, with those that a YAML file gives in their place.
 
@@ -47,6 +44,7 @@ def config_from(
         file: of settings.
         suite: in place of the preset's.
         method: in place of the file's, or of DMIL.
+        demos: the source of demonstrations, in place of the file's.
 
     Raises:
         UserError: names the key, what it got and what is allowed.
@@ -66,6 +64,8 @@ def config_from(
     settings = merged(settings, given, str(file))
     if method is not None:
         settings["method"]["name"] = method
+    if demos is not None:
+        settings["demonstrations"]["source"] = demos
     return checked(settings, "" if file is None else f"{file}: ")
 
 

@@ -14,8 +14,8 @@ import click
 
 from dmil_core.errors import UserError
 from services import meta_train, tune_sweep
-from services.cli.arguments import parse
-from services.cli.composition import defaults_from
+from services.cli.arguments import parse, peek
+from services.cli.composition import EARLY, defaults_from
 from tests.deploy.manifests import DEPLOY, ask
 
 PROGRAMS = {"ray", "mlflow", "python", "weed", "prometheus", "pg_isready", "wget"}
@@ -78,7 +78,7 @@ def _refused_by_module(module: str, flags: Sequence[str]) -> str | None:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             match module:
                 case "services.meta_train":
-                    defaults: Any = meta_train.Arguments(defaults_from(flags))
+                    defaults: Any = meta_train.Arguments(defaults_from(peek(flags, **EARLY)))
                     parse(meta_train.Arguments, "", flags, defaults)
                 case "services.tune_sweep":
                     given = parse(tune_sweep.Arguments, "", flags, tune_sweep.Arguments())

@@ -5,8 +5,8 @@ import pytest
 
 from dmil_core.configs import ExperimentConfig, preset_of
 from services import meta_train
-from services.cli.arguments import parse
-from services.cli.composition import checked, defaults_from
+from services.cli.arguments import parse, peek
+from services.cli.composition import EARLY, checked, defaults_from
 from services.reporting.settings import flags, nearest_preset
 
 
@@ -46,5 +46,5 @@ def test_the_flags_give_the_settings_again(config: ExperimentConfig):
     found = nearest_preset(config)
     arguments = ["--suite", config.suite.name, "--preset", found.size, "--method", config.method.name]
     arguments += shlex.split(flags(found.differing))
-    given = parse(meta_train.Arguments, "", arguments, meta_train.Arguments(defaults_from(arguments)))
+    given = parse(meta_train.Arguments, "", arguments, meta_train.Arguments(defaults_from(peek(arguments, **EARLY))))
     assert given.experiment == config
