@@ -19,12 +19,12 @@ from torch import Tensor
 from benchmarks.masked_twin import MaskedTwin
 from benchmarks.timing import alternate, write_rows
 from benchmarks.workload import ACTION_DIM, OBS_DIM, as_in_a_run, draw_parameters, draw_steps, settings
-from dmil_core.demonstrations import Demonstration, Standardisation
+from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.methods.base import FineTuning
 from dmil_core.methods.dmil.adaptation import Hierarchy, adapt
 from dmil_core.methods.dmil.method import DmilPolicy
 from dmil_core.methods.mil.method import Mil, MilConfig
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 
@@ -74,8 +74,8 @@ def _contests(given: Arguments) -> list[Contest]:
 
 def _mil(given: Arguments) -> Contest:
     config = MilConfig()
-    method = Mil(config, ACTION_DIM, Standardisation.identity(OBS_DIM))
-    parameters = method.initial_parameters(stream(0, "benchmark parameters"))
+    method = Mil(config, ACTION_DIM, Normalisation.identity(OBS_DIM))
+    parameters = method.initial_parameters(named_rng(0, "benchmark parameters"))
     support = [
         Demonstration(str(number), "drawn", steps.states.numpy(), steps.actions.numpy())
         for number, steps in enumerate(draw_steps(seed, 1, 100) for seed in range(given.shots))
@@ -105,7 +105,7 @@ def _dmil(given: Arguments) -> list[Contest]:
     def theirs() -> dict[str, Tensor]:
         return {name: tensor.detach() for name, tensor in twin.adapt(parameters, support, steps, rate).items()}
 
-    policy, adapted = DmilPolicy(ours(), Standardisation.identity(OBS_DIM)), theirs()
+    policy, adapted = DmilPolicy(ours(), Normalisation.identity(OBS_DIM)), theirs()
     difference = max((policy.hierarchy.parameters[name] - adapted[name]).abs().max().item() for name in adapted)
     assert difference < 1e-3, f"ours and the twin differ by {difference}"
     weights = torch.randn(sum(layer.weight.numel() for layer in (*hierarchy.high, *hierarchy.low[0])))

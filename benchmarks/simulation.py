@@ -35,7 +35,7 @@ from dmil_core.methods.base import FineTuning, Policy
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.dmil.method import Dmil
 from dmil_core.networks import Parameters, flatten
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.distributed.simulation_worker import SimulationWorker
@@ -280,7 +280,7 @@ def one_policy(
     support = [demonstration for found in demonstrations.values() for demonstration in found]
     assert isinstance(config.method, DmilConfig)
     method = Dmil.prepared(config.method, suite.action_dim, support)
-    initial = method.initial_parameters(stream(config.seed, "initial parameters"))
+    initial = method.initial_parameters(named_rng(config.seed, "initial parameters"))
     policy = method.adapt(initial, support, FineTuning(steps, config.evaluation.learning_rate))
     return method, policy.hierarchy.parameters, demonstrations
 

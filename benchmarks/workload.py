@@ -13,7 +13,7 @@ from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.dmil.method import Dmil
 from dmil_core.networks import Parameters, flatten, initialise, unflatten
 from dmil_core.outer_loop import OuterState
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 from services.distributed.runner import Plan
 from services.suites.metaworld import MetaWorldSuite
 
@@ -47,7 +47,7 @@ def draw_sets(size: Size, config: DmilConfig, task: int) -> Sets:
 def draw_parameters(config: DmilConfig) -> Parameters:
     """Draw He-initialised networks: their labels and choices use several of the sub-skills."""
     hidden, k = [config.hidden_units] * config.hidden_layers, config.sub_skills
-    draw = stream(0, "benchmark parameters")
+    draw = named_rng(0, "benchmark parameters")
     return {
         **initialise("high", [OBS_DIM, *hidden, k], draw),
         **initialise("low", [OBS_DIM, *hidden, ACTION_DIM], draw, copies=k),
@@ -84,7 +84,7 @@ def made_up_plan(preset: str, slots_per_group: int | None = None) -> Plan:
     }
     assert isinstance(config.method, DmilConfig)
     method = Dmil.prepared(config.method, suite.action_dim, [d for task in demonstrations.values() for d in task])
-    initial = method.initial_parameters(stream(0, "initial parameters"))
+    initial = method.initial_parameters(named_rng(0, "initial parameters"))
     shapes = {name: tensor.shape for name, tensor in initial.items()}
     if slots_per_group is not None:
         training = training.model_copy(update={"slots_per_group": slots_per_group})

@@ -102,7 +102,7 @@ class TaskBatch:
 
 
 def sample_task_batch(
-    demonstrations: Sequence[Demonstration], trajectories: int, window: int | None, stream: np.random.Generator
+    demonstrations: Sequence[Demonstration], trajectories: int, window: int | None, rng: np.random.Generator
 ) -> TaskBatch:
     """Draw {τ1}..{τ4} of Algorithm 1 for one task, `trajectories` in each.
 
@@ -113,7 +113,7 @@ def sample_task_batch(
         demonstrations: all training demonstrations of one task.
         trajectories: the number of trajectories in each set.
         window: cut each to so many consecutive steps at a random place; `None` takes them whole.
-        stream: where the choice comes from.
+        rng: where the choice comes from.
 
     Raises:
         DemonstrationError: if there is no demonstration.
@@ -122,33 +122,33 @@ def sample_task_batch(
     if total == 0:
         raise DemonstrationError("demonstrations: got none for this task; wanted at least one; collect some first")
     if total >= 4 * trajectories:
-        chosen = stream.permutation(total)[: 4 * trajectories].reshape(4, trajectories)
+        chosen = rng.permutation(total)[: 4 * trajectories].reshape(4, trajectories)
     else:
-        chosen = np.stack([stream.choice(total, trajectories, replace=total < trajectories) for _ in range(4)])
+        chosen = np.stack([rng.choice(total, trajectories, replace=total < trajectories) for _ in range(4)])
 
     def cut(demonstration: Demonstration) -> Demonstration:
         if window is None or len(demonstration) <= window:
             return demonstration
-        return demonstration.window(int(stream.integers(len(demonstration) - window + 1)), window)
+        return demonstration.window(int(rng.integers(len(demonstration) - window + 1)), window)
 
     sets = [tuple(cut(demonstrations[index]) for index in row) for row in chosen]
     return TaskBatch(demonstrations[0].task, *sets)
 
 
 @dataclass(frozen=True, eq=False)
-class Standardisation:
+class Normalisation:
     """How observations are brought to zero mean and unit scale before a network sees them."""
 
     mean: Float32[np.ndarray, " obs_dim"]
     scale: Float32[np.ndarray, " obs_dim"]
 
     @classmethod
-    def identity(cls, obs_dim: int) -> "Standardisation":
+    def identity(cls, obs_dim: int) -> "Normalisation":
         """Leave observations as they are."""
         return cls(np.zeros(obs_dim, np.float32), np.ones(obs_dim, np.float32))
 
     @classmethod
-    def of(cls, demonstrations: Sequence[Demonstration], floor: float = 0.02) -> "Standardisation":
+    def of(cls, demonstrations: Sequence[Demonstration], floor: float = 0.02) -> "Normalisation":
         """Take mean and standard deviation over all steps of `demonstrations`.
 
         Args:

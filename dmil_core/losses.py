@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from dmil_core.demonstrations import Demonstration, Standardisation
+from dmil_core.demonstrations import Demonstration, Normalisation
 
 Targets: TypeAlias = Int[Tensor, " steps"] | Float[Tensor, "steps sub_skills"]
 """What the high level should predict at each step: a sub-skill, or a weight for each."""
@@ -23,12 +23,12 @@ class Steps(NamedTuple):
     lengths: Int[Tensor, " trajectories"]
 
     @classmethod
-    def of(cls, demonstrations: Sequence[Demonstration], standardise: Standardisation) -> "Steps":
+    def of(cls, demonstrations: Sequence[Demonstration], normalise: Normalisation) -> "Steps":
         """Copy demonstrations into fresh tensors: what a worker receives is shared memory and stays untouched."""
         observations = np.concatenate([demonstration.observations for demonstration in demonstrations])
         actions = np.concatenate([demonstration.actions for demonstration in demonstrations])
         lengths = [len(demonstration) for demonstration in demonstrations]
-        return cls(torch.from_numpy(standardise(observations)), torch.from_numpy(actions), torch.tensor(lengths))
+        return cls(torch.from_numpy(normalise(observations)), torch.from_numpy(actions), torch.tensor(lengths))
 
 
 class OutputLoss(NamedTuple):

@@ -30,7 +30,7 @@ Network: TypeAlias = tuple[Layer, ...]
 def initialise(
     prefix: str,
     sizes: Sequence[int],
-    stream: np.random.Generator,
+    rng: np.random.Generator,
     copies: int | None = None,
     output_scale: float = 1.0,
 ) -> Parameters:
@@ -39,11 +39,11 @@ def initialise(
     Args:
         prefix: what the names begin with: ``{prefix}.{layer}.weight`` and ``{prefix}.{layer}.bias``.
         sizes: units from the input to the output, both included.
-        stream: where the weights are drawn from.
+        rng: where the weights are drawn from.
         copies: draw a bank of so many networks, stacked along a first axis.
         output_scale: scale of the output layer's weights, against He's.
     """
-    generator = torch.Generator().manual_seed(int(stream.integers(2**63)))
+    generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
     batch = () if copies is None else (copies,)
     parameters: dict[str, Tensor] = {}
     for layer, (fan_in, fan_out) in enumerate(itertools.pairwise(sizes)):

@@ -12,15 +12,15 @@ from torch import Tensor
 from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import as_work_error
-from dmil_core.methods.base import MetaLearner, Policy, PractisingLearner, Rollout, TaskGradient
+from dmil_core.methods.base import MetaLearner, OnlineMetaLearner, Policy, Rollout, TaskGradient
 from dmil_core.networks import Parameters
-from dmil_core.seeding import stream, stream_seed
+from dmil_core.seeding import named_rng, named_seed
 
 BLOCKS_PER_WORKER = 4
 """Blocks that each worker should find at least, so that a slow one takes fewer and the others do not wait."""
 
 
-Practise: TypeAlias = Callable[[Policy, str, int, int], Sequence[Rollout]]
+CollectRollouts: TypeAlias = Callable[[Policy, str, int, int], Sequence[Rollout]]
 """Lets a policy act in a task's environments: policy, task, seed, and steps in all, of whole episodes but the last."""
 
 
@@ -58,7 +58,7 @@ class OuterState(NamedTuple):
 
 def tasks_of(iteration: int, tasks: Sequence[str], seed: int, slots: int) -> list[str]:
     """Return the task of each slot of an iteration: every task once before any comes again."""
-    draw = stream(seed, "tasks", iteration)
+    draw = named_rng(seed, "tasks", iteration)
     rounds = -(-slots // len(tasks))
     return [tasks[int(index)] for _ in range(rounds) for index in draw.permutation(len(tasks))][:slots]
 
@@ -97,14 +97,14 @@ def add(gradients: Sequence[Float32[np.ndarray, " size"]]) -> Float32[np.ndarray
 
 
 def group_gradient(
-    method: MetaLearner[Any],
+    method: MetaLearner[Any, Any],
     demonstrations: Mapping[str, Sequence[Demonstration]],
     parameters: Parameters,
     seed: int,
     iteration: int,
     tasks: Sequence[str],
     slots: Sequence[int],
-    practise: Practise | None = None,
+    collect_rollouts: CollectRollouts | None = None,
 ) -> GroupGradient:
     """Return the summed outer gradient of some slots of an iteration: a pure function of its arguments.
 
@@ -116,7 +116,7 @@ def group_gradient(
         iteration: counts from 0.
         tasks: the task of every slot of the iteration, see `tasks_of`.
         slots: which of them to compute.
-        practise: lets a policy act in a task's environments, for a `PractisingLearner`.
+        collect_rollouts: lets a policy act in a task's environments, for a `OnlineMetaLearner`.
 
     Raises:
         WorkError: for a Python error in one of them, which is named.
@@ -125,15 +125,15 @@ def group_gradient(
     for slot in slots:
         task = tasks[slot]
         with as_work_error(slot_label(iteration, slot, task, seed), iteration=iteration, slot=slot):
-            material = method.sample(demonstrations[task], iteration, stream(seed, "batch", iteration, slot))
-            if isinstance(method, PractisingLearner) and (steps := method.practice_steps(iteration)):
-                assert practise is not None
-                explorer = method.explorer(parameters, material)
-                rollouts = practise(explorer, task, stream_seed(seed, "practice", iteration, slot), steps)
-                material = method.with_practice(material, rollouts)
-            result = method.task_gradient(parameters, material)
+            batch = method.sample(demonstrations[task], iteration, named_rng(seed, "batch", iteration, slot))
+            if isinstance(method, OnlineMetaLearner) and (steps := method.environment_steps(iteration)):
+                assert collect_rollouts is not None
+                policy = method.exploration_policy(parameters, batch)
+                rollouts = collect_rollouts(policy, task, named_seed(seed, "practice", iteration, slot), steps)
+                batch = method.with_rollouts(batch, rollouts)
+            result = method.task_gradient(parameters, batch)
         if not _finite(result):
-            nonfinite.append(NonfiniteSlot(slot, task, tuple(material.ids)))
+            nonfinite.append(NonfiniteSlot(slot, task, tuple(batch.ids)))
         terms.append(result.gradient)
         metrics.append(result.metrics)
     gradient = torch.full_like(terms[0], torch.nan) if nonfinite else tree_sum(terms)

@@ -87,7 +87,7 @@ def stratified_bootstrap(
 
     Args:
         outcomes: of each episode; differences of paired episodes are outcomes too.
-        draw: the stream of the resampling.
+        draw: the rng of the resampling.
         confidence: of the interval.
     """
     seeds, tasks, episodes = outcomes.shape
@@ -126,7 +126,7 @@ def profile_band(
     Args:
         runs: the success rate, or mean score, of each seed on each task.
         thresholds: of the profile.
-        draw: the stream of the resampling.
+        draw: the rng of the resampling.
         confidence: of the band.
     """
     again = runs[draw.integers(len(runs), size=(BOOTSTRAP_DRAWS, len(runs)))]

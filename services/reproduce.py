@@ -56,7 +56,9 @@ def _slot(failure: Failure, experiment: Experiment) -> Callable[[], object]:
         raise RunError(f"{checkpoint.path}: got iteration {checkpoint.manifest.iteration}; wanted {iteration}")
     tasks = tasks_of(iteration, list(sets), config.seed, config.training.tasks_per_iteration)
     slot, worker = int(failure.piece["slot"]), SimulationWorker(experiment.suite)
-    return lambda: group_gradient(method, sets, parameters, config.seed, iteration, tasks, [slot], worker.practise)
+    return lambda: group_gradient(
+        method, sets, parameters, config.seed, iteration, tasks, [slot], worker.collect_rollouts
+    )
 
 
 def _adaptation(failure: Failure, experiment: Experiment) -> Callable[[], object]:

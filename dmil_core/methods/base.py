@@ -1,14 +1,13 @@
-"""The one interface of a method of few-shot imitation.
+"""The interface of a method of few-shot imitation.
 
-A method is an immutable value: its settings and what it learned once from the data, such as the standardisation.
-What it learns iteration by iteration are named tensors, which it is handed and never keeps. So every call is a pure
-function of its arguments and can be made again anywhere. What a method needs is said by its type:
+A method is an immutable value: its settings, and what it computed once from the data, such as the normalisation of
+observations. What it learns iteration by iteration are named tensors, which are passed to it and which it never keeps.
+So every call is a pure function of its arguments, which any process can repeat. There are three kinds:
 
-- `Method`: turns a support set into a policy, by gradients or without; nearest neighbour is no more than that.
-- `MetaLearner`: also learns across tasks. What is local to a task lives inside `task_gradient` and `adapt`, such as the
-  high level of MLSH; a policy keeps what acting needs, such as the support set in MIL's encoder, and what it must
-  remember from step to step, such as OptionGAIL's option, is its `memory`.
-- `PractisingLearner`: also acts in the environments of meta-training tasks, as OptionGAIL does.
+- `Method` turns a support set into a policy, by gradients or without.
+- `MetaLearner` also learns across tasks. What belongs to one task lives inside `task_gradient` and `adapt`, such as the
+  high level of MLSH; a policy keeps what acting needs, such as the support set in MIL's encoder.
+- `OnlineMetaLearner` also acts in the environments of meta-training tasks, as OptionGAIL does.
 """
 
 from abc import ABC, abstractmethod
@@ -20,28 +19,13 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 
-from dmil_core.demonstrations import Demonstration, Standardisation
+from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.networks import Parameters
 from dmil_core.settings import MethodConfig
 
 
-@runtime_checkable
-class Drawn(Protocol):
-    """What one slot of an iteration learns from."""
-
-    @property
-    def ids(self) -> Sequence[str]:
-        """The ids of the demonstrations in it."""
-        ...
-
-
-Material = TypeVar("Material", bound=Drawn)
-Config = TypeVar("Config", bound=MethodConfig)
-Own = TypeVar("Own", bound="Standardised[Any]")
-
-
 class Decision(NamedTuple):
-    """What a policy does in several episodes at once."""
+    """Actions of a policy in several episodes at once."""
 
     actions: Float32[np.ndarray, "episodes action_dim"]
     sub_skills: Int64[np.ndarray, " episodes"]
@@ -49,7 +33,7 @@ class Decision(NamedTuple):
 
 
 class SubSkillUse(NamedTuple):
-    """Which sub-skill a policy takes at each step of a demonstration, and which one fits the action best."""
+    """Sub-skill that a policy takes at each step of a demonstration, and the one that fits the action best."""
 
     chosen: Int64[np.ndarray, " steps"]
     best: Int64[np.ndarray, " steps"]
@@ -59,12 +43,12 @@ class SubSkillUse(NamedTuple):
 class Policy(Protocol):
     """A policy adapted to one task, acting in several episodes in lockstep.
 
-    What it must remember between steps it returns as `memory`, one row an episode, and is handed back: rows of
-    finished episodes are dropped by the caller.
+    What it must remember between steps it returns as `memory`, one row an episode, and receives again at the next
+    step: the caller drops the rows of finished episodes.
     """
 
     def start(self, episodes: int) -> Int64[np.ndarray, "episodes memory_dim"]:
-        """Return the memory of so many episodes that begin."""
+        """Return the memory of episodes at their first step."""
         ...
 
     def act(
@@ -87,66 +71,106 @@ class Memoryless:
 
 
 class Flat(Memoryless):
-    """Base of such policies without sub-skills."""
+    """Base of memoryless policies without sub-skills."""
 
     def sub_skill_use(self, demonstration: Demonstration) -> SubSkillUse:
-        """Return sub-skill 0 throughout: there are no others."""
-        none = np.zeros(len(demonstration), np.int64)
-        return SubSkillUse(none, none)
+        """Return sub-skill 0 throughout."""
+        zeros = np.zeros(len(demonstration), np.int64)
+        return SubSkillUse(zeros, zeros)
 
 
 class FineTuning(NamedTuple):
-    """How to adapt at test; a method without gradient at test ignores it."""
+    """Gradient steps of adaptation at test; a method without any ignores it."""
 
     steps: int
     learning_rate: float
 
 
-@runtime_checkable
-class Method(Protocol):
-    """Anything that turns a support set into a policy."""
+Config = TypeVar("Config", bound=MethodConfig)
+Own = TypeVar("Own", bound="Method[Any]")
+
+
+@dataclass(frozen=True)
+class Method(ABC, Generic[Config]):
+    """Turns a support set into a policy, for observations and actions of given sizes."""
+
+    config: Config
+    action_dim: int
+    normalise: Normalisation
+
+    config_type: ClassVar[type[MethodConfig]]
+    """Class of the settings, whose default name is the method's."""
+
+    @classmethod
+    def prepared(cls: type[Own], config: Config, action_dim: int, demonstrations: Sequence[Demonstration]) -> Own:
+        """Return the method with the observation statistics of all meta-training demonstrations."""
+        if config.standardise:
+            return cls(config, action_dim, Normalisation.of(demonstrations))
+        return cls(config, action_dim, Normalisation.identity(demonstrations[0].observations.shape[1]))
+
+    @classmethod
+    def restored(cls: type[Own], config: Config, action_dim: int, constants: Mapping[str, np.ndarray]) -> Own:
+        """Return the method whose `constants` were stored."""
+        return cls(config, action_dim, Normalisation(constants["observation_mean"], constants["observation_scale"]))
 
     def constants(self) -> Mapping[str, np.ndarray]:
-        """Return what the method learned once from the data, to be stored with its parameters."""
-        ...
+        """Return the observation statistics, to be stored beside the parameters."""
+        return {"observation_mean": self.normalise.mean, "observation_scale": self.normalise.scale}
 
-    def initial_parameters(self, stream: np.random.Generator) -> Parameters:
-        """Draw the parameters to start from, which may be none."""
-        ...
+    @property
+    def obs_dim(self) -> int:
+        """Size of an observation."""
+        return len(self.normalise.mean)
 
+    @abstractmethod
+    def initial_parameters(self, rng: np.random.Generator) -> Parameters:
+        """Draw the initial parameters, which may be none."""
+
+    @abstractmethod
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> Policy:
-        """Return the policy adapted to the support demonstrations of one task; `parameters` stay as they are."""
+        """Return the policy adapted to the support demonstrations of one task; `parameters` stay unchanged."""
+
+
+@runtime_checkable
+class Batch(Protocol):
+    """Data that one slot of an iteration learns from."""
+
+    @property
+    def ids(self) -> Sequence[str]:
+        """Ids of its demonstrations."""
         ...
+
+
+BatchT = TypeVar("BatchT", bound=Batch)
 
 
 class TaskGradient(NamedTuple):
-    """One task's contribution to the outer step, flat in the parameters' order, and what to show of it."""
+    """Contribution of one task to the outer step, flat in the parameters' order, and metrics of it."""
 
     gradient: Float[Tensor, " size"]
     metrics: Mapping[str, float]
 
 
-@runtime_checkable
-class MetaLearner(Method, Protocol[Material]):
-    """A method that learns across tasks, by gradients that add up over the slots of a batch."""
+class MetaLearner(Method[Config], Generic[Config, BatchT]):
+    """A method that learns across tasks, by gradients that add up over the slots of an iteration."""
 
-    def sample(self, demonstrations: Sequence[Demonstration], iteration: int, stream: np.random.Generator) -> Material:
-        """Draw from one task's demonstrations what one slot of an iteration learns from.
+    @abstractmethod
+    def sample(self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator) -> BatchT:
+        """Draw the batch of one slot from the demonstrations of its task.
 
         Args:
             demonstrations: of the task.
-            iteration: counts from 0; decides of phases, if there are any.
-            stream: where all is drawn from; what `task_gradient` draws later is named by a seed in the material.
+            iteration: counts from 0; decides the phase, where a method has phases.
+            rng: source of all randomness; what `task_gradient` draws comes from a seed in the batch.
         """
-        ...
 
-    def task_gradient(self, parameters: Parameters, material: Material) -> TaskGradient:
-        """Return one slot's outer gradient.
+    @abstractmethod
+    def task_gradient(self, parameters: Parameters, batch: BatchT) -> TaskGradient:
+        """Return the outer gradient of one slot.
 
-        With ``outer_step == "average"`` it is how far the slot's own steps went, the other way round: parameters before
-        minus parameters after. The metrics have the ``loss``, and ``sub_skill_share/K`` where there are sub-skills.
+        With ``outer_step == "average"`` it is the parameters before the slot's own steps minus those after. The
+        metrics contain ``loss``, and ``sub_skill_share/K`` for each sub-skill.
         """
-        ...
 
 
 class Rollout(NamedTuple):
@@ -159,63 +183,20 @@ class Rollout(NamedTuple):
     success: bool
     """An episode ends with its first success."""
     ended: bool
-    """Whether it came to its end, by success or its last step, and was not cut off."""
+    """Whether the episode ended, by success or at its horizon, and was not cut off."""
 
 
-@runtime_checkable
-class PractisingLearner(MetaLearner[Material], Protocol[Material]):
-    """A method that also learns from acting in the environments of meta-training tasks."""
-
-    def practice_steps(self, iteration: int) -> int:
-        """Return how many steps each slot of an iteration acts, which may be none."""
-        ...
-
-    def explorer(self, parameters: Parameters, material: Material) -> Policy:
-        """Return the policy that acts; what is random in it is named by a seed in the material and by its memory."""
-        ...
-
-    def with_practice(self, material: Material, rollouts: Sequence[Rollout]) -> Material:
-        """Return the material with what came of acting."""
-        ...
-
-
-@dataclass(frozen=True)
-class Standardised(ABC, Generic[Config]):
-    """Base of the methods: its settings, and the standardisation as all that is learned once."""
-
-    config: Config
-    action_dim: int
-    standardise: Standardisation
-
-    config_type: ClassVar[type[MethodConfig]]
-    """Of the settings, whose default name is the method's."""
-
-    @classmethod
-    def prepared(cls: type[Own], config: Config, action_dim: int, demonstrations: Sequence[Demonstration]) -> Own:
-        """Return the method with what it learns once from the demonstrations of all meta-training tasks."""
-        if config.standardise:
-            return cls(config, action_dim, Standardisation.of(demonstrations))
-        return cls(config, action_dim, Standardisation.identity(demonstrations[0].observations.shape[1]))
-
-    @classmethod
-    def restored(cls: type[Own], config: Config, action_dim: int, constants: Mapping[str, np.ndarray]) -> Own:
-        """Return the method whose `constants` were stored."""
-        standardise = Standardisation(constants["observation_mean"], constants["observation_scale"])
-        return cls(config, action_dim, standardise)
-
-    def constants(self) -> Mapping[str, np.ndarray]:
-        """Return the observation statistics."""
-        return {"observation_mean": self.standardise.mean, "observation_scale": self.standardise.scale}
-
-    @property
-    def obs_dim(self) -> int:
-        """Numbers in an observation."""
-        return len(self.standardise.mean)
+class OnlineMetaLearner(MetaLearner[Config, BatchT]):
+    """A method that also acts in the environments of meta-training tasks."""
 
     @abstractmethod
-    def initial_parameters(self, stream: np.random.Generator) -> Parameters:
-        """Draw the parameters to start from, which may be none."""
+    def environment_steps(self, iteration: int) -> int:
+        """Return the environment steps of each slot of an iteration, which may be 0."""
 
     @abstractmethod
-    def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> Policy:
-        """Return the policy adapted to the support demonstrations of one task."""
+    def exploration_policy(self, parameters: Parameters, batch: BatchT) -> Policy:
+        """Return the policy that acts; its randomness comes from a seed in the batch and from its memory alone."""
+
+    @abstractmethod
+    def with_rollouts(self, batch: BatchT, rollouts: Sequence[Rollout]) -> BatchT:
+        """Return the batch with rollouts of the exploration policy."""

@@ -77,6 +77,6 @@ def scaled(rewards: Float[Tensor, " draws"]) -> Float[Tensor, " draws"]:
     return rewards / rewards.square().mean().sqrt().clamp_min(SMALLEST)
 
 
-def standardised(advantages: Float[Tensor, " draws"]) -> Float[Tensor, " draws"]:
+def normalised(advantages: Float[Tensor, " draws"]) -> Float[Tensor, " draws"]:
     """Return advantages with mean 0 and standard deviation 1, or 0 where they are all the same."""
     return (advantages - advantages.mean()) / advantages.std(correction=0).clamp_min(SMALLEST)

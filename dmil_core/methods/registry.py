@@ -4,7 +4,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from dmil_core.errors import UserError, shown
-from dmil_core.methods.base import Standardised
+from dmil_core.methods.base import Method
 from dmil_core.methods.behaviour_cloning.method import BehaviourCloning, PerTask
 from dmil_core.methods.dmil.method import Dmil
 from dmil_core.methods.mil.method import Mil
@@ -15,8 +15,8 @@ from dmil_core.methods.pemirl.method import Pemirl
 from dmil_core.settings import MethodConfig
 
 ENTRY_POINTS = "dmil.methods"
-"""The group of entry points in which a package registers a method, see `Standardised`."""
-OURS: dict[str, type[Standardised[Any]]] = {
+"""The group of entry points in which a package registers a method, see `Method`."""
+OURS: dict[str, type[Method[Any]]] = {
     "dmil": Dmil,
     "option-gail": OptionGail,
     "option-gail-offline": OptionGailOffline,
@@ -43,7 +43,7 @@ def method_names() -> list[str]:
     return [*OURS, *sorted(_registered())]
 
 
-def method_type(name: object) -> type[Standardised[Any]]:
+def method_type(name: object) -> type[Method[Any]]:
     """Return the class of a method.
 
     Raises:
@@ -93,7 +93,7 @@ def _registered() -> dict[str, Any]:
     return found
 
 
-def _loaded(point: Any) -> type[Standardised[Any]]:
+def _loaded(point: Any) -> type[Method[Any]]:
     """Import the class that a package registers."""
     where = f"method.name: got {point.name}, {point.value}"
     try:
@@ -103,6 +103,6 @@ def _loaded(point: Any) -> type[Standardised[Any]]:
             f"{where}, which cannot be imported: {type(error).__name__}: {error}; wanted what the entry point names; "
             "mend its package, or install it again"
         ) from error
-    if not (isinstance(found, type) and issubclass(found, Standardised)):
-        raise MethodError(f"{where}: got {shown(found)}; wanted a class derived from Standardised; see {GUIDE}")
+    if not (isinstance(found, type) and issubclass(found, Method)):
+        raise MethodError(f"{where}: got {shown(found)}; wanted a class derived from Method; see {GUIDE}")
     return found

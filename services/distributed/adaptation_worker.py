@@ -46,7 +46,7 @@ class AdaptationWorker:
 
     def __init__(
         self,
-        method: MetaLearner[Any],
+        method: MetaLearner[Any, Any],
         shapes: Mapping[str, torch.Size],
         demonstrations: Mapping[str, Sequence[Demonstration]],
         seed: int,
@@ -58,7 +58,7 @@ class AdaptationWorker:
         stays pure work.
         """
         torch.set_num_threads(1)
-        self._practise = SimulationWorker(suite).practise if suite is not None else None
+        self._collect_rollouts = SimulationWorker(suite).collect_rollouts if suite is not None else None
         self._method, self._shapes, self._demonstrations, self._seed = method, shapes, demonstrations, seed
 
     def gradient(self, parameters: Chunks, block: Block, previous: Sequence[Any] = ()) -> tuple[BlockReport, Chunks]:
@@ -76,7 +76,14 @@ class AdaptationWorker:
         own = unflatten(torch.from_numpy(from_chunks(parameters)), self._shapes)
         results = [
             group_gradient(
-                self._method, self._demonstrations, own, self._seed, block.iteration, block.tasks, slots, self._practise
+                self._method,
+                self._demonstrations,
+                own,
+                self._seed,
+                block.iteration,
+                block.tasks,
+                slots,
+                self._collect_rollouts,
             )
             for slots in block.groups
         ]

@@ -25,7 +25,7 @@ from services.suites.base import TaskSuite
 class Plan(NamedTuple):
     """What meta-training starts from; only the state changes on the way."""
 
-    method: MetaLearner[Any]
+    method: MetaLearner[Any, Any]
     shapes: Mapping[str, torch.Size]
     """Names and shapes of the parameters, in the order in which they are laid out flat."""
     demonstrations: Mapping[str, Sequence[Demonstration]]

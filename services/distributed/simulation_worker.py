@@ -12,9 +12,9 @@ from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import as_work_error
 from dmil_core.methods.base import Method, Policy, Rollout
 from dmil_core.networks import unflatten
-from dmil_core.seeding import stream_seed
+from dmil_core.seeding import named_seed
 from services.rollouts.adaptations import Adaptation, AdaptationOutcome, Imitation, imitate, try_out
-from services.rollouts.episodes import demonstrate, episodes_beside, practise
+from services.rollouts.episodes import collect_rollouts, demonstrate, episodes_beside
 from services.rollouts.verification import VerificationRow, verify
 from services.suites.base import Attempt, Environment, TaskSuite, build_env
 
@@ -51,7 +51,7 @@ class SimulationWorker:
         assert expert is not None
         steps, attempts = config.steps(task, self._suite.horizon), []
         for number in numbers:
-            seed = stream_seed(config.seed, "demonstration", task, number)
+            seed = named_seed(config.seed, "demonstration", task, number)
             with as_work_error(f"task {task}, attempt {number}, seed {seed}", task=task, attempt=number):
                 attempts.append(demonstrate(expert, env, seed, steps, config))
         return attempts
@@ -65,10 +65,10 @@ class SimulationWorker:
         with as_work_error(f"task {task}, seeds {seeds[0]} to {seeds[-1]}", task=task, seed=seeds[0]):
             return verify(self._suite, task, seeds, noise)
 
-    def practise(self, policy: Policy, task: str, seed: int, steps: int) -> list[Rollout]:
-        """Let a policy act in a task for so many steps, see `services.rollouts.episodes.practise`."""
+    def collect_rollouts(self, policy: Policy, task: str, seed: int, steps: int) -> list[Rollout]:
+        """Let a policy act in a task for so many steps, see `services.rollouts.episodes.collect_rollouts`."""
         envs = self._environments(task, episodes_beside(steps, self._suite.horizon))
-        return practise(policy, envs, seed, steps, self._suite.horizon)
+        return collect_rollouts(policy, envs, seed, steps, self._suite.horizon)
 
     def try_out(
         self,

@@ -20,7 +20,7 @@ from pydantic import BaseModel
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import UserError
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 from dmil_core.statistics import Interval, interquartile_mean, mean_score, stratified_bootstrap, success_rate
 from services.evaluation.paper_results import Published
 from services.evaluation.results import EpisodeResult, EvaluationFolder, Metric
@@ -237,7 +237,7 @@ def cell(
     low: float | None
     high: float | None
     if len(seeds) > 1:
-        mean, low, high = stratified_bootstrap(values, stream(0, "table", *map(str, place)))
+        mean, low, high = stratified_bootstrap(values, named_rng(0, "table", *map(str, place)))
         kind = "bootstrap over seeds and episodes"
     elif metric == "success_rate":
         rate, kind = success_rate((values > 0).ravel().tolist()), "Wilson"
@@ -277,7 +277,7 @@ def difference(place: Place, baseline: str, outcomes: Outcomes, others: Outcomes
         if why := _what_differs(outcomes[seed], others[seed]):
             return Unpaired(**pair, why=why)
     values = np.stack([outcomes[seed].outcomes - others[seed].outcomes for seed in seeds])
-    found: Interval = stratified_bootstrap(values, stream(0, "difference", *map(str, place)))
+    found: Interval = stratified_bootstrap(values, named_rng(0, "difference", *map(str, place)))
     differs: Answer = "yes, higher" if found.low > 0 else "yes, lower" if found.high < 0 else "not decided"
     return Difference(**pair, seeds=seeds, pairs=values.size, **found._asdict(), differs=differs)
 

@@ -8,11 +8,11 @@ from typing import Any, Literal
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import UserError
-from dmil_core.methods.base import MetaLearner, Method, PractisingLearner, Standardised
+from dmil_core.methods.base import MetaLearner, Method, OnlineMetaLearner
 from dmil_core.methods.registry import method_type
 from dmil_core.networks import Parameters, flatten
 from dmil_core.outer_loop import OuterState
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 from services.cli.live_view import Figures
 from services.cli.progress import Bar
 from services.demonstrations.collection import DemonstrationCollection
@@ -104,14 +104,14 @@ class Experiment:
 
     # Meta-training
 
-    def method(self, training_sets: Mapping[str, Sequence[Demonstration]]) -> Standardised[Any]:
+    def method(self, training_sets: Mapping[str, Sequence[Demonstration]]) -> Method[Any]:
         """Return the method, with what it learns once from the training demonstrations."""
         settings, demonstrations = self.config.method, [d for task in training_sets.values() for d in task]
         return method_type(settings.name).prepared(settings, self.suite.action_dim, demonstrations)
 
     def initial_parameters(self, method: Method) -> Parameters:
         """Draw the parameters that meta-training starts from."""
-        return method.initial_parameters(stream(self.config.seed, "initial parameters"))
+        return method.initial_parameters(named_rng(self.config.seed, "initial parameters"))
 
     def train(
         self,
@@ -161,7 +161,7 @@ class Experiment:
             evaluations.finish()
             return resume or Checkpoint(writer.write(state))
         assert isinstance(method, MetaLearner)
-        suite = self.suite if isinstance(method, PractisingLearner) else None  # takes a worker seconds to import
+        suite = self.suite if isinstance(method, OnlineMetaLearner) else None  # takes a worker seconds to import
         skip, seed = on_nonfinite == "skip", self.config.seed
         plan = Plan(method, manifest.torch_shapes, sets, state, self.config.training, seed, skip, suite)
         log = IterationLog(runner, tracker, evaluations)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from dmil_core.methods.base import Policy
-from dmil_core.seeding import stream_seed
+from dmil_core.seeding import named_seed
 from dmil_core.settings import sub_skills_of
 from services.experiments.finished_run import FinishedRun
 from services.reporting.lineup import Lineup, has_sub_skills, policies
@@ -75,7 +75,7 @@ def _acted(policy: Policy, run: FinishedRun, task: str, envs: Sequence[Environme
     if not envs:
         return []
     episodes = [run.config.evaluation.support_draws * place for place in range(len(envs))]
-    seeds = [stream_seed(run.config.seed, "evaluation", task, episode) for episode in episodes]
+    seeds = [named_seed(run.config.seed, "evaluation", task, episode) for episode in episodes]
     try:
         recorded = record(policy, envs, seeds, horizon, horizon)
     except FloatingPointError:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 from matplotlib.lines import Line2D
 
-from dmil_core.demonstrations import Demonstration, Standardisation
+from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.settings import sub_skills_of
 from services.cli.progress import Bar
 from services.reporting.drawing import Picture, colour_of, drawn, panels
@@ -102,7 +102,7 @@ def _draw(lineup: Lineup, task: str, shots: int, perplexity: float, seed: int) -
     runs = {label: run for label, run in lineup.runs.items() if has_sub_skills(run)}
     kept = thin_out(others, min(MOST_STATES, MOST_POINTS // (2 * len(runs))))
     perplexity = min(perplexity, max(1.0, (len(kept.states) - 1) / 3))
-    places = embed(Standardisation.of(others)(kept.states), perplexity, seed)
+    places = embed(Normalisation.of(others)(kept.states), perplexity, seed)
     shown = [
         _Panel(
             f"{label}, {adaptation} adaptation",

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 from dmil_core.statistics import interquartile_mean, performance_profile, profile_band
 from services.reporting.drawing import DASHES, Picture, colour_of, drawn, panels
 
@@ -30,7 +30,7 @@ def profiles(where: str, rows: Sequence[str], by_shots: Mapping[int, Runs], metr
         for axis, (shots, own) in zip(axes, by_shots.items(), strict=True):
             for row, runs in own.items():
                 middle = f"{row}: {interquartile_mean(runs.ravel().tolist()):.{digits}f}"
-                _draw(axis, rows.index(row), runs, top, middle, stream(0, "profile", where, str(shots), row))
+                _draw(axis, rows.index(row), runs, top, middle, named_rng(0, "profile", where, str(shots), row))
                 told.append(f"{shots}-shot {middle} over {runs.size} runs")
             axis.set(title=f"{where}, {shots}-shot", xlabel=f"{metric} τ", ylabel="fraction of runs above τ")
             axis.set(xlim=(-0.01 * top, 1.02 * top), ylim=(-0.02, 1.02))

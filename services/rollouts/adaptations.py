@@ -10,7 +10,7 @@ from dmil_core.configs import EvaluationConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import FineTuning, Method, Policy, SubSkillUse
 from dmil_core.networks import Parameters
-from dmil_core.seeding import stream_seed
+from dmil_core.seeding import named_seed
 from services.rollouts.episodes import Episode, rollout
 from services.suites.base import Environment, Split
 
@@ -101,7 +101,7 @@ def try_out(
     """
     support = adaptation.support(held_out)
     policy = method.adapt(parameters, support, FineTuning(evaluation.fine_tuning_steps, evaluation.learning_rate))
-    seeds = [stream_seed(seed, "evaluation", adaptation.task, episode) for episode in adaptation.episodes]
+    seeds = [named_seed(seed, "evaluation", adaptation.task, episode) for episode in adaptation.episodes]
     others = [demonstration for demonstration in held_out if demonstration not in support]
     episodes = rollout(policy, envs[: len(seeds)], seeds, horizon)
     return AdaptationOutcome(episodes, [policy.sub_skill_use(demonstration) for demonstration in others])

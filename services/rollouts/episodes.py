@@ -8,7 +8,7 @@ from gymnasium.spaces import Box
 
 from dmil_core.configs import DemonstrationConfig
 from dmil_core.methods.base import Policy, Rollout
-from dmil_core.seeding import stream, stream_seed
+from dmil_core.seeding import named_rng, named_seed
 from services.suites.base import Attempt, Environment, Expert
 
 
@@ -79,7 +79,7 @@ def episodes_beside(steps: int, horizon: int) -> int:
     return max(1, steps // horizon)
 
 
-def practise(policy: Policy, envs: Sequence[Environment], seed: int, steps: int, horizon: int) -> list[Rollout]:
+def collect_rollouts(policy: Policy, envs: Sequence[Environment], seed: int, steps: int, horizon: int) -> list[Rollout]:
     """Let a policy act for so many steps in all, in rounds of `episodes_beside` episodes; the last ones may be cut off.
 
     An episode ends as in `rollout`.
@@ -94,7 +94,7 @@ def practise(policy: Policy, envs: Sequence[Environment], seed: int, steps: int,
     rollouts: list[Rollout] = []
     while steps > 0:
         numbers = range(len(rollouts), len(rollouts) + episodes_beside(steps, horizon))
-        seeds = [stream_seed(seed, "episode", number) for number in numbers]
+        seeds = [named_seed(seed, "episode", number) for number in numbers]
         found = record(policy, envs, seeds, min(horizon, steps), horizon)
         steps -= sum(len(rollout.actions) for rollout in found)
         rollouts += found
@@ -153,7 +153,7 @@ def demonstrate(expert: Expert, env: Environment, seed: int, horizon: int, confi
         horizon: the attempt is given up after so many steps.
         config: noise, labels and trailing steps.
     """
-    disturbance = stream(seed, "expert noise")
+    disturbance = named_rng(seed, "expert noise")
     observation, info = env.reset(seed=seed)
     goal = info.get("goal", [])
     observations, actions = [observation], []

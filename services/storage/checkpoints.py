@@ -17,7 +17,7 @@ from safetensors.numpy import load, save
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import UserError, explain, shown
-from dmil_core.methods.base import Standardised
+from dmil_core.methods.base import Method
 from dmil_core.methods.registry import method_type
 from dmil_core.networks import Parameters, flatten, unflatten
 from dmil_core.outer_loop import OuterState
@@ -158,7 +158,7 @@ class Checkpoint:
         """Return the parameters, a new copy each time, laid out as in meta-training."""
         return unflatten(torch.from_numpy(self.state.parameters), self.manifest.torch_shapes)
 
-    def method(self, action_dim: int) -> Standardised[Any]:
+    def method(self, action_dim: int) -> Method[Any]:
         """Return the method that the parameters are of, for actions of so many numbers."""
         settings = self.manifest.config.method
         return method_type(settings.name).restored(settings, action_dim, self.constants)

@@ -11,7 +11,7 @@ from pydantic import AliasChoices, Field, model_validator
 
 from dmil_core.configs import EvaluationConfig, ExperimentConfig, SuiteConfig, SuiteName, preset_of
 from dmil_core.errors import UserError
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 from dmil_core.settings import Count, NotNegative, Seed, Settings
 from services.cli.composition import checked, method_named
 from services.cli.yaml_files import merged
@@ -86,7 +86,7 @@ class Search(Settings):
         for number in range(self.samples):
             settings: Overrides = {}
             for path, values in self.space.items():
-                draw = stream(self.seed, "search", number, path)
+                draw = named_rng(self.seed, "search", number, path)
                 value = values.draw(draw) if isinstance(values, Range) else values[int(draw.integers(len(values)))]
                 section, _, setting = path.partition(".")
                 settings.setdefault(section, {})[setting] = value

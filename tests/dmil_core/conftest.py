@@ -51,10 +51,10 @@ def make_parameters() -> Callable[..., Parameters]:
     def make(
         seed: int, sub_skills: int, hidden: Sequence[int] = (8, 8), dtype: torch.dtype = torch.float64
     ) -> Parameters:
-        stream, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+        rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
         drawn = {
-            **initialise("high", [OBS_DIM, *hidden, sub_skills], stream),
-            **initialise("low", [OBS_DIM, *hidden, ACTION_DIM], stream, copies=sub_skills),
+            **initialise("high", [OBS_DIM, *hidden, sub_skills], rng),
+            **initialise("low", [OBS_DIM, *hidden, ACTION_DIM], rng, copies=sub_skills),
         }
         return {
             name: (tensor + 0.3 * torch.randn(tensor.shape, generator=generator)).to(dtype)
@@ -93,13 +93,13 @@ def make_demonstrations() -> Callable[..., list[Demonstration]]:
     """Draw demonstrations of the given lengths for one task."""
 
     def make(seed: int, lengths: Sequence[int]) -> list[Demonstration]:
-        stream = np.random.default_rng(seed)
+        rng = np.random.default_rng(seed)
         return [
             Demonstration(
                 f"d{index}",
                 "reach",
-                stream.normal(size=(length, OBS_DIM)).astype(np.float32),
-                stream.normal(size=(length, ACTION_DIM)).astype(np.float32),
+                rng.normal(size=(length, OBS_DIM)).astype(np.float32),
+                rng.normal(size=(length, ACTION_DIM)).astype(np.float32),
             )
             for index, length in enumerate(lengths)
         ]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from dmil_core.demonstrations import (
     Demonstration,
     DemonstrationError,
-    Standardisation,
+    Normalisation,
     TaskBatch,
     digest,
     sample_task_batch,
@@ -108,8 +108,8 @@ def test_windows_lie_inside_their_trajectories(make_demonstrations, lengths, win
 
 
 def test_every_demonstration_and_every_window_is_drawn(make_demonstrations) -> None:
-    demonstrations, stream = make_demonstrations(0, [6] * 9), np.random.default_rng(0)
-    batches = [sample_task_batch(demonstrations, 2, 4, stream) for _ in range(100)]
+    demonstrations, rng = make_demonstrations(0, [6] * 9), np.random.default_rng(0)
+    batches = [sample_task_batch(demonstrations, 2, 4, rng) for _ in range(100)]
     ids = {cut.id for batch in batches for cut in itertools.chain(*batch.sets)}
     assert ids == {f"d{index}[{start}:{start + 4}]" for index in range(9) for start in range(3)}
 
@@ -135,9 +135,9 @@ def test_standardised_steps_have_zero_mean_and_unit_variance(make_demonstrations
         dataclasses.replace(demonstration, observations=demonstration.observations * units + 10 * units)
         for demonstration in make_demonstrations(0, [40, 1, 25])
     ]
-    standardise = Standardisation.of(demonstrations)
+    normalise = Normalisation.of(demonstrations)
     before = demonstrations[0].observations.copy()
-    steps = np.concatenate([standardise(demonstration.observations) for demonstration in demonstrations])
+    steps = np.concatenate([normalise(demonstration.observations) for demonstration in demonstrations])
     assert steps.dtype == np.float32
     np.testing.assert_allclose(steps.mean(0), 0, atol=1e-5)
     np.testing.assert_allclose(steps.std(0), 1, rtol=1e-5)
@@ -146,14 +146,14 @@ def test_standardised_steps_have_zero_mean_and_unit_variance(make_demonstrations
 
 def test_the_scale_respects_its_floor() -> None:
     observations = np.array([[5.0, 0.0], [5.0, 1.0]], np.float32)
-    standardise = Standardisation.of([Demonstration("d0", "reach", observations, zeros(2, 1))], floor=0.25)
-    np.testing.assert_allclose(standardise.scale, [0.25, 0.5])
-    np.testing.assert_allclose(standardise(observations), [[0, -1], [0, 1]])
+    normalise = Normalisation.of([Demonstration("d0", "reach", observations, zeros(2, 1))], floor=0.25)
+    np.testing.assert_allclose(normalise.scale, [0.25, 0.5])
+    np.testing.assert_allclose(normalise(observations), [[0, -1], [0, 1]])
 
 
 def test_identity_leaves_observations_as_they_are(make_demonstrations) -> None:
     (demonstration,) = make_demonstrations(0, [6])
-    standardised = Standardisation.identity(4)(demonstration.observations)
+    standardised = Normalisation.identity(4)(demonstration.observations)
     assert np.array_equal(standardised, demonstration.observations)
     assert not np.shares_memory(standardised, demonstration.observations)
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.nn import functional
 
-from dmil_core.demonstrations import Standardisation
+from dmil_core.demonstrations import Normalisation
 from dmil_core.losses import (
     Steps,
     behaviour_cloning_loss,
@@ -208,10 +208,10 @@ def test_switching_is_the_probability_that_two_draws_differ() -> None:
 
 def test_steps_are_standardised_copies_in_order(make_demonstrations) -> None:
     demonstrations = make_demonstrations(0, [3, 1, 2])
-    standardise = Standardisation.of(demonstrations)
-    steps = Steps.of(demonstrations, standardise)
+    normalise = Normalisation.of(demonstrations)
+    steps = Steps.of(demonstrations, normalise)
     assert steps.lengths.tolist() == [3, 1, 2]
-    states = torch.cat([torch.from_numpy(standardise(d.observations)) for d in demonstrations])
+    states = torch.cat([torch.from_numpy(normalise(d.observations)) for d in demonstrations])
     assert torch.equal(steps.states, states)
     before = demonstrations[0].actions.copy()
     for tensor in (steps.states, steps.actions):
@@ -222,7 +222,7 @@ def test_steps_are_standardised_copies_in_order(make_demonstrations) -> None:
 
 def test_steps_of_one_demonstration_share_no_memory_with_it(make_demonstrations) -> None:
     (demonstration,) = make_demonstrations(0, [4])
-    steps = Steps.of([demonstration], Standardisation.identity(demonstration.observations.shape[1]))
+    steps = Steps.of([demonstration], Normalisation.identity(demonstration.observations.shape[1]))
     observed, acted = demonstration.observations.copy(), demonstration.actions.copy()
     for tensor in (steps.states, steps.actions):
         tensor.zero_()

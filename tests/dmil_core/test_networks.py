@@ -56,8 +56,8 @@ def test_initial_parameters_follow_their_stream() -> None:
     assert all(torch.equal(one[name], same[name]) for name in one)
     assert not torch.equal(one["a.0.weight"], other["a.0.weight"])
     assert not torch.equal(one["a.0.weight"][0], one["a.0.weight"][1])
-    stream = np.random.default_rng(0)
-    assert not torch.equal(initialise("a", SIZES, stream)["a.0.weight"], initialise("a", SIZES, stream)["a.0.weight"])
+    rng = np.random.default_rng(0)
+    assert not torch.equal(initialise("a", SIZES, rng)["a.0.weight"], initialise("a", SIZES, rng)["a.0.weight"])
 
 
 def module(layers: list[tuple[torch.Tensor, torch.Tensor]]) -> torch.nn.Sequential:

@@ -14,8 +14,8 @@ from dmil_core.outer_loop import BLOCKS_PER_WORKER, OuterState, OuterStep, add, 
 
 def gradients_of(seed: int, count: int) -> list[np.ndarray]:
     """Draw vectors whose sum depends on the order of addition: magnitudes from 1e-4 to 1e4."""
-    stream = np.random.default_rng(seed)
-    return list((stream.normal(size=(count, 50)) * 10.0 ** stream.integers(-4, 5, (count, 50))).astype(np.float32))
+    rng = np.random.default_rng(seed)
+    return list((rng.normal(size=(count, 50)) * 10.0 ** rng.integers(-4, 5, (count, 50))).astype(np.float32))
 
 
 def reduce(gradients: list[np.ndarray], fan_in: int) -> np.ndarray:

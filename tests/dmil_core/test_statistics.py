@@ -87,11 +87,11 @@ def test_bootstrap_keeps_every_task_its_weight() -> None:
 
 
 def test_bootstrap_covers_the_truth_about_as_often_as_it_says() -> None:
-    stream, covered = np.random.default_rng(1), 0
+    rng, covered = np.random.default_rng(1), 0
     for _ in range(200):
-        rates = stream.beta(20, 10, size=(8, 1, 1))
-        outcomes = (stream.random((8, 3, 10)) < rates).astype(float)
-        got = stratified_bootstrap(outcomes, stream)
+        rates = rng.beta(20, 10, size=(8, 1, 1))
+        outcomes = (rng.random((8, 3, 10)) < rates).astype(float)
+        got = stratified_bootstrap(outcomes, rng)
         covered += got.low <= 2 / 3 <= got.high
     assert 170 <= covered <= 200
 

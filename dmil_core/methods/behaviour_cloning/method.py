@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Int64
 
-from dmil_core.demonstrations import Demonstration, Standardisation, TaskBatch, sample_task_batch
+from dmil_core.demonstrations import Demonstration, Normalisation, TaskBatch, sample_task_batch
 from dmil_core.losses import Steps, behaviour_cloning_loss
-from dmil_core.methods.base import Decision, FineTuning, Flat, Standardised, TaskGradient
+from dmil_core.methods.base import Decision, FineTuning, Flat, MetaLearner, Method, TaskGradient
 from dmil_core.networks import Layer, Network, Parameters, initialise, mlp, network, unflatten
 from dmil_core.settings import Count, MethodConfig, Positive, Size
 from dmil_core.slopes import slope
@@ -84,13 +84,13 @@ class NetworkPolicy(Flat):
     """One network acts: a = π(s)."""
 
     network: Network
-    standardise: Standardisation
+    normalise: Normalisation
 
     def act(
         self, observations: Float32[np.ndarray, "episodes obs_dim"], memory: Int64[np.ndarray, "episodes 0"]
     ) -> Decision:
         """Choose one action for each episode."""
-        actions = mlp(self.network, torch.from_numpy(self.standardise(observations)))
+        actions = mlp(self.network, torch.from_numpy(self.normalise(observations)))
         return Decision(actions.numpy(), np.zeros(len(observations), np.int64), memory)
 
 
@@ -105,12 +105,12 @@ def fine_tuned(policy: Network, steps: Steps, optimiser: type[torch.optim.Optimi
     return tuple(Layer(*(tensor.detach() for tensor in layer)) for layer in layers)
 
 
-class _OneNetwork(Standardised[Any]):
-    def initial_parameters(self, stream: np.random.Generator) -> Parameters:
+class _OneNetwork(Method[Any]):
+    def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the network."""
         hidden = [self.config.hidden_units] * self.config.hidden_layers
         sizes = [self.obs_dim, *hidden, self.action_dim]
-        return initialise(PREFIX, sizes, stream, output_scale=self.config.output_scale)
+        return initialise(PREFIX, sizes, rng, output_scale=self.config.output_scale)
 
     def _adapted(
         self,
@@ -119,22 +119,22 @@ class _OneNetwork(Standardised[Any]):
         optimiser: type[torch.optim.Optimizer],
         tuning: FineTuning,
     ) -> NetworkPolicy:
-        steps = Steps.of(support, self.standardise)
-        return NetworkPolicy(fine_tuned(network(parameters, PREFIX), steps, optimiser, tuning), self.standardise)
+        steps = Steps.of(support, self.normalise)
+        return NetworkPolicy(fine_tuned(network(parameters, PREFIX), steps, optimiser, tuning), self.normalise)
 
 
-class BehaviourCloning(_OneNetwork):
+class BehaviourCloning(_OneNetwork, MetaLearner[Any, TaskBatch]):
     """Behaviour cloning for observations and actions of given sizes."""
 
     config_type = BehaviourCloningConfig
 
-    def sample(self, demonstrations: Sequence[Demonstration], iteration: int, stream: np.random.Generator) -> TaskBatch:
+    def sample(self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator) -> TaskBatch:
         """Draw what DMIL would draw."""
-        return sample_task_batch(demonstrations, self.config.trajectories, self.config.window, stream)
+        return sample_task_batch(demonstrations, self.config.trajectories, self.config.window, rng)
 
-    def task_gradient(self, parameters: Parameters, material: TaskBatch) -> TaskGradient:
+    def task_gradient(self, parameters: Parameters, batch: TaskBatch) -> TaskGradient:
         """Return ∇ L_BC on all that was drawn."""
-        steps = Steps.of([drawn for demonstrations in material.sets for drawn in demonstrations], self.standardise)
+        steps = Steps.of([drawn for demonstrations in batch.sets for drawn in demonstrations], self.normalise)
         of_policy = slope(
             network(parameters, PREFIX), steps.states, lambda outputs: behaviour_cloning_loss(outputs, steps.actions)
         )

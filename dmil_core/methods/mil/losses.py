@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int, Int64
 from torch import Tensor
 
-from dmil_core.demonstrations import Demonstration, Standardisation
+from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.losses import squared_errors
 from dmil_core.methods.base import FineTuning, TaskGradient
 from dmil_core.methods.mil.config import MilConfig
@@ -35,7 +35,7 @@ class Support(NamedTuple):
 
     @classmethod
     def of(
-        cls, demonstrations: Sequence[Demonstration], standardise: Standardisation, positions: int, units: int
+        cls, demonstrations: Sequence[Demonstration], normalise: Normalisation, positions: int, units: int
     ) -> "Support":
         """Copy demonstrations into fresh tensors, at most `positions` evenly spaced steps of each."""
         places = [_evenly(len(demonstration), positions) for demonstration in demonstrations]
@@ -45,7 +45,7 @@ class Support(NamedTuple):
             for arrays in ([one.observations for one in demonstrations], [one.actions for one in demonstrations])
         )
         return cls(
-            torch.from_numpy(standardise(observations)),
+            torch.from_numpy(normalise(observations)),
             torch.from_numpy(actions),
             position_encoding(torch.cat([torch.arange(count) for count in counts]), units),
             torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts)),

@@ -40,8 +40,8 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Int64
 
-from dmil_core.demonstrations import Demonstration, DemonstrationError, Standardisation
-from dmil_core.methods.base import Decision, FineTuning, Flat, Standardised, TaskGradient
+from dmil_core.demonstrations import Demonstration, DemonstrationError, Normalisation
+from dmil_core.methods.base import Decision, FineTuning, Flat, MetaLearner, TaskGradient
 from dmil_core.methods.mil import transformer
 from dmil_core.methods.mil.config import MilConfig
 from dmil_core.methods.mil.losses import Pairs, Support, adapted, outer_gradient
@@ -73,23 +73,23 @@ class MilPolicy(Flat):
 
     parameters: Parameters
     cache: Cache
-    standardise: Standardisation
+    normalise: Normalisation
 
     def act(
         self, observations: Float32[np.ndarray, "episodes obs_dim"], memory: Int64[np.ndarray, "episodes 0"]
     ) -> Decision:
         """Choose one action for each episode."""
-        actions = decode(self.parameters, torch.from_numpy(self.standardise(observations)), self.cache)
+        actions = decode(self.parameters, torch.from_numpy(self.normalise(observations)), self.cache)
         return Decision(actions.numpy(), np.zeros(len(observations), np.int64), memory)
 
 
 @dataclass(frozen=True)
-class Mil(Standardised[MilConfig]):
+class Mil(MetaLearner[MilConfig, MilBatch]):
     """MIL for observations and actions of given sizes."""
 
     config_type = MilConfig
 
-    def initial_parameters(self, stream: np.random.Generator) -> Parameters:
+    def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the transformer."""
         config = self.config
         sizes = Sizes(
@@ -103,9 +103,9 @@ class Mil(Standardised[MilConfig]):
             config.feed_forward_units,
             config.shots,
         )
-        return transformer.initialise(sizes, stream, config.output_scale)
+        return transformer.initialise(sizes, rng, config.output_scale)
 
-    def sample(self, demonstrations: Sequence[Demonstration], iteration: int, stream: np.random.Generator) -> MilBatch:
+    def sample(self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator) -> MilBatch:
         """Draw one to `shots` demonstrations as the support set, and query pairs from all others.
 
         Raises:
@@ -118,11 +118,11 @@ class Mil(Standardised[MilConfig]):
                 f"demonstrations: got {total} for this task; wanted at least 2, one to read and one to ask for; "
                 "collect more"
             )
-        shots = int(stream.integers(1, min(self.config.shots, total - 1) + 1))
-        order = [demonstrations[index] for index in stream.permutation(total)]
+        shots = int(rng.integers(1, min(self.config.shots, total - 1) + 1))
+        order = [demonstrations[index] for index in rng.permutation(total)]
         support, others = order[:shots], order[shots:]
         ends = np.cumsum([len(demonstration) for demonstration in others])
-        pairs = stream.choice(ends[-1], min(self.config.batch_pairs, int(ends[-1])), replace=False)
+        pairs = rng.choice(ends[-1], min(self.config.batch_pairs, int(ends[-1])), replace=False)
         owners = np.searchsorted(ends, pairs, side="right")
         steps = pairs - np.concatenate([[0], ends])[owners]
         drawn = [(others[owner], step) for owner, step in zip(owners, steps, strict=True)]
@@ -131,13 +131,13 @@ class Mil(Standardised[MilConfig]):
             np.stack([demonstration.observations[step] for demonstration, step in drawn]),
             np.stack([demonstration.actions[step] for demonstration, step in drawn]),
             tuple(others[owner].id for owner in np.unique(owners)),
-            int(stream.integers(2**63)),
+            int(rng.integers(2**63)),
         )
 
-    def task_gradient(self, parameters: Parameters, material: MilBatch) -> TaskGradient:
+    def task_gradient(self, parameters: Parameters, batch: MilBatch) -> TaskGradient:
         """Return the outer gradient of one task."""
-        query = Pairs(torch.from_numpy(self.standardise(material.observations)), torch.tensor(material.actions))
-        return outer_gradient(parameters, self._support(material.support), query, self.config, material.seed)
+        query = Pairs(torch.from_numpy(self.normalise(batch.observations)), torch.tensor(batch.actions))
+        return outer_gradient(parameters, self._support(batch.support), query, self.config, batch.seed)
 
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> MilPolicy:
         """Take the inner loop's steps on the support set and encode it.
@@ -158,7 +158,7 @@ class Mil(Standardised[MilConfig]):
             views = cached(fixed, encode(fixed, *steps, heads), heads)
         # In one piece, or each action would copy them.
         cache = tuple((keys.contiguous(), values.contiguous()) for keys, values in views)
-        return MilPolicy(fixed, cache, self.standardise)
+        return MilPolicy(fixed, cache, self.normalise)
 
     def _support(self, demonstrations: Sequence[Demonstration]) -> Support:
-        return Support.of(demonstrations, self.standardise, self.config.positions, self.config.units)
+        return Support.of(demonstrations, self.normalise, self.config.positions, self.config.units)

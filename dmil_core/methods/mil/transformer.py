@@ -50,15 +50,15 @@ class Sizes(NamedTuple):
     """How many are told apart."""
 
 
-def initialise(sizes: Sizes, stream: np.random.Generator, output_scale: float = 1.0) -> Parameters:
+def initialise(sizes: Sizes, rng: np.random.Generator, output_scale: float = 1.0) -> Parameters:
     """Draw the parameters: uniform weights that keep the variance (LeCun et al. 1998), zero biases, plain norms.
 
     Args:
         sizes: of the transformer.
-        stream: where the weights are drawn from.
+        rng: where the weights are drawn from.
         output_scale: scale of the output layer's weights, against all others.
     """
-    generator = torch.Generator().manual_seed(int(stream.integers(2**63)))
+    generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
     parameters: dict[str, Tensor] = {}
 
     def weight(name: str, outputs: int, inputs: int, *, bias: bool = True, scale: float = 1.0) -> None:

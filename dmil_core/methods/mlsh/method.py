@@ -42,14 +42,14 @@ import torch
 from jaxtyping import Float, Float32, Int, Int64
 from torch import Tensor
 
-from dmil_core.demonstrations import Demonstration, DemonstrationError, Standardisation
+from dmil_core.demonstrations import Demonstration, DemonstrationError, Normalisation
 from dmil_core.losses import Steps, squared_errors, sub_skill_labels
-from dmil_core.methods.base import Decision, FineTuning, Standardised, SubSkillUse, TaskGradient
+from dmil_core.methods.base import Decision, FineTuning, MetaLearner, SubSkillUse, TaskGradient
 from dmil_core.methods.mlsh.config import MlshConfig
 from dmil_core.methods.mlsh.macro_steps import MacroSteps, draw_batch, macro_steps
-from dmil_core.methods.ppo import clipped_surrogate, scaled, standardised, trajectory_advantages
+from dmil_core.methods.ppo import clipped_surrogate, normalised, scaled, trajectory_advantages
 from dmil_core.networks import Layer, Network, Parameters, bank, flatten, initialise, mlp, network, own_states
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 
 FRESH_SCALE = 0.01
 """Scale of a fresh high level's last layer, against He's."""
@@ -94,7 +94,7 @@ class MlshPolicy:
     low: tuple[Network, ...]
     """Sub-skills without their values."""
     macro_step: int
-    standardise: Standardisation
+    normalise: Normalisation
 
     def start(self, episodes: int) -> Int64[np.ndarray, "episodes 2"]:
         """Return that no step of a macro-step is done, and so no sub-skill is picked yet."""
@@ -104,7 +104,7 @@ class MlshPolicy:
         self, observations: Float32[np.ndarray, "episodes obs_dim"], memory: Int64[np.ndarray, "episodes 2"]
     ) -> Decision:
         """Choose one action and its sub-skill for each episode; the memory is the steps done and the sub-skill."""
-        states = torch.from_numpy(self.standardise(observations))
+        states = torch.from_numpy(self.normalise(observations))
         done, chosen = torch.from_numpy(memory).unbind(1)
         if (done == 0).any():
             chosen = torch.where(done == 0, mlp(self.high, states).argmax(-1), chosen)
@@ -117,7 +117,7 @@ class MlshPolicy:
 
     def sub_skill_use(self, demonstration: Demonstration) -> SubSkillUse:
         """Return the high level's choice, held for each macro-step, and the argmin of the error at each step."""
-        steps = Steps.of([demonstration], self.standardise)
+        steps = Steps.of([demonstration], self.normalise)
         macro = macro_steps(steps.lengths, self.macro_step)
         chosen = mlp(self.high, steps.states[macro.first]).argmax(-1)[macro.of_step]
         errors = torch.stack([squared_errors(mlp(sub_skill, steps.states), steps.actions) for sub_skill in self.low])
@@ -215,7 +215,7 @@ class _Task:
     ) -> _Outcome:
         config = self.config
         advantages = trajectory_advantages(scaled(rewards), values, lengths, config.discount, config.trace)
-        return _Outcome(standardised(advantages), advantages + values)
+        return _Outcome(normalised(advantages), advantages + values)
 
     def _log_densities(
         self, means: Float[Tensor, "steps action_dim"], actions: Float[Tensor, "steps action_dim"]
@@ -263,18 +263,18 @@ def _errors(low: Sequence[Network], steps: Steps) -> Float[Tensor, "sub_skills s
 
 
 @dataclass(frozen=True)
-class Mlsh(Standardised[MlshConfig]):
+class Mlsh(MetaLearner[MlshConfig, MlshBatch]):
     """MLSH for observations and actions of given sizes."""
 
     config_type = MlshConfig
 
-    def initial_parameters(self, stream: np.random.Generator) -> Parameters:
+    def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the bank of sub-skills; each one's last output is its value."""
         config = self.config
         sizes = [self.obs_dim, *[config.hidden_units] * config.hidden_layers, self.action_dim + 1]
-        return initialise("low", sizes, stream, copies=config.sub_skills, output_scale=config.output_scale)
+        return initialise("low", sizes, rng, copies=config.sub_skills, output_scale=config.output_scale)
 
-    def sample(self, demonstrations: Sequence[Demonstration], iteration: int, stream: np.random.Generator) -> MlshBatch:
+    def sample(self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator) -> MlshBatch:
         """Draw whole demonstrations, without replacement.
 
         Raises:
@@ -282,15 +282,15 @@ class Mlsh(Standardised[MlshConfig]):
         """
         if not demonstrations:
             raise DemonstrationError("demonstrations: got none for this task; wanted at least one; collect some first")
-        drawn = stream.permutation(len(demonstrations))[: self.config.trajectories]
-        return MlshBatch(tuple(demonstrations[index] for index in drawn), int(stream.integers(2**63)))
+        drawn = rng.permutation(len(demonstrations))[: self.config.trajectories]
+        return MlshBatch(tuple(demonstrations[index] for index in drawn), int(rng.integers(2**63)))
 
-    def task_gradient(self, parameters: Parameters, material: MlshBatch) -> TaskGradient:
+    def task_gradient(self, parameters: Parameters, batch: MlshBatch) -> TaskGradient:
         """Learn one task from its demonstrations and return how far the bank went, the other way round."""
-        config, steps = self.config, Steps.of(material.demonstrations, self.standardise)
-        high = self._fresh_high(np.random.default_rng(material.seed), config.high_learning_rate)
+        config, steps = self.config, Steps.of(batch.demonstrations, self.normalise)
+        high = self._fresh_high(np.random.default_rng(batch.seed), config.high_learning_rate)
         low = _Learning(parameters, config.sub_skill_learning_rate)
-        task = _Task(steps, config, torch.Generator().manual_seed(material.seed))
+        task = _Task(steps, config, torch.Generator().manual_seed(batch.seed))
         before = _errors(_actors(parameters), steps)
         task.warm_up(high, before, config.warm_up_updates)
         chosen_before = self._mode(high, steps)
@@ -308,13 +308,17 @@ class Mlsh(Standardised[MlshConfig]):
 
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> MlshPolicy:
         """Learn a fresh high level on the support set, its steps being updates; the sub-skills stay as they are."""
-        steps, low, random = Steps.of(support, self.standardise), _actors(parameters), stream(0, "mlsh", "adapt")
+        steps, low, random = (
+            Steps.of(support, self.normalise),
+            _actors(parameters),
+            named_rng(0, "mlsh", "adapt"),
+        )
         high = self._fresh_high(random, fine_tuning.learning_rate)
         task = _Task(steps, self.config, torch.Generator().manual_seed(int(random.integers(2**63))))
         task.warm_up(high, _errors(low, steps), fine_tuning.steps)
         *hidden, output = network(high.learned, "high")
         logits = Layer(output.weight[:-1], output.bias[:-1])
-        return MlshPolicy((*hidden, logits), low, self.config.macro_step, self.standardise)
+        return MlshPolicy((*hidden, logits), low, self.config.macro_step, self.normalise)
 
     def _fresh_high(self, random: np.random.Generator, learning_rate: float) -> _Learning:
         """Draw a high level; its last output is its value."""

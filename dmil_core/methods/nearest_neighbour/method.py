@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Int64
 
-from dmil_core.demonstrations import Demonstration, Standardisation
+from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.losses import Steps
-from dmil_core.methods.base import Decision, FineTuning, Flat, Standardised
+from dmil_core.methods.base import Decision, FineTuning, Flat, Method
 from dmil_core.networks import Parameters
 from dmil_core.settings import MethodConfig
 
@@ -37,23 +37,23 @@ class NearestNeighbourPolicy(Flat):
     """Does what was done in the nearest state of the support set, the first of equally near ones."""
 
     support: Steps
-    standardise: Standardisation
+    normalise: Normalisation
 
     def act(
         self, observations: Float32[np.ndarray, "episodes obs_dim"], memory: Int64[np.ndarray, "episodes 0"]
     ) -> Decision:
         """Choose one action for each episode."""
-        states = torch.from_numpy(self.standardise(observations))
+        states = torch.from_numpy(self.normalise(observations))
         nearest = torch.cdist(states, self.support.states, compute_mode="donot_use_mm_for_euclid_dist").argmin(1)
         return Decision(self.support.actions[nearest].numpy(), np.zeros(len(observations), np.int64), memory)
 
 
-class NearestNeighbour(Standardised[NearestNeighbourConfig]):
+class NearestNeighbour(Method[NearestNeighbourConfig]):
     """The nearest neighbour for observations and actions of given sizes."""
 
     config_type = NearestNeighbourConfig
 
-    def initial_parameters(self, stream: np.random.Generator) -> Parameters:
+    def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Return none: nothing is learned."""
         return {}
 
@@ -61,4 +61,4 @@ class NearestNeighbour(Standardised[NearestNeighbourConfig]):
         self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning
     ) -> NearestNeighbourPolicy:
         """Keep the support set."""
-        return NearestNeighbourPolicy(Steps.of(support, self.standardise), self.standardise)
+        return NearestNeighbourPolicy(Steps.of(support, self.normalise), self.normalise)

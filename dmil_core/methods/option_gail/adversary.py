@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from dmil_core.demonstrations import Standardisation
+from dmil_core.demonstrations import Normalisation
 from dmil_core.losses import Steps
 from dmil_core.methods.base import Rollout
 from dmil_core.methods.option_gail.config import OptionGailConfig
@@ -30,9 +30,9 @@ def named(parameters: Parameters, prefixes: str | tuple[str, ...]) -> list[Tenso
     return [tensor for name, tensor in parameters.items() if name.startswith(prefixes)]
 
 
-def orthogonal(prefix: str, sizes: Sequence[int], stream: np.random.Generator) -> Parameters:
+def orthogonal(prefix: str, sizes: Sequence[int], rng: np.random.Generator) -> Parameters:
     """Draw the parameters of a perceptron: orthogonal weights (Saxe et al. 2014), scaled by √2 before a ReLU."""
-    generator = torch.Generator().manual_seed(int(stream.integers(2**63)))
+    generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
     parameters: dict[str, Tensor] = {}
     for layer, (fan_in, fan_out) in enumerate(itertools.pairwise(sizes)):
         gain = 2**0.5 if layer < len(sizes) - 2 else 1.0
@@ -54,13 +54,13 @@ class Played(NamedTuple):
         return cls(steps, options_before(options, steps.lengths, start), options)
 
     @classmethod
-    def of_rollouts(cls, rollouts: Sequence[Rollout], standardise: Standardisation, start: int) -> "Played":
+    def of_rollouts(cls, rollouts: Sequence[Rollout], normalise: Normalisation, start: int) -> "Played":
         """Return the steps of rollouts, none of them empty, one after the other."""
         states = np.concatenate([rollout.observations[:-1] for rollout in rollouts])
         actions = np.concatenate([rollout.actions for rollout in rollouts])
         options = np.concatenate([rollout.sub_skills for rollout in rollouts])
         lengths = torch.tensor([len(rollout.actions) for rollout in rollouts])
-        steps = Steps(torch.from_numpy(standardise(states)), torch.from_numpy(actions), lengths)
+        steps = Steps(torch.from_numpy(normalise(states)), torch.from_numpy(actions), lengths)
         return cls.of(steps, torch.from_numpy(options), start)
 
     def at(self, index: Int[Tensor, " chosen"]) -> "Played":

@@ -45,7 +45,7 @@ from torch import Tensor
 
 from dmil_core.demonstrations import Demonstration
 from dmil_core.losses import Steps
-from dmil_core.methods.base import FineTuning, Rollout, Standardised, TaskGradient
+from dmil_core.methods.base import FineTuning, MetaLearner, OnlineMetaLearner, Rollout, TaskGradient
 from dmil_core.methods.option_gail.adversary import (
     POLICY,
     Played,
@@ -66,14 +66,14 @@ from dmil_core.methods.option_gail.option_model import (
     viterbi,
     weighted_log_likelihood,
 )
-from dmil_core.methods.option_gail.policy import OptionExplorer, OptionPolicy
+from dmil_core.methods.option_gail.policy import OptionExplorationPolicy, OptionPolicy
 from dmil_core.networks import Parameters, flatten, initialise
 
 Phase = Literal["likelihood", "hard", "adversarial"]
 
 
 @dataclass(frozen=True)
-class OptionMaterial:
+class OptionBatch:
     """Whole demonstrations of a task, what is done with them, and what came of acting."""
 
     demonstrations: tuple[Demonstration, ...]
@@ -100,16 +100,16 @@ class _Imitated(NamedTuple):
     pairs: Float[Tensor, "steps before options"]
 
 
-class _Options(Standardised[Any]):
+class _Options(MetaLearner[Any, OptionBatch]):
     """What both methods share: one option model, by EM."""
 
-    def initial_parameters(self, stream: np.random.Generator) -> Parameters:
+    def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the option model: σ = 1."""
         hidden = [self.config.hidden_units] * self.config.hidden_layers
         k, scale = self.config.sub_skills, self.config.output_scale
         return {
-            **initialise("high", [self.obs_dim, *hidden, (k + 1) * k], stream, output_scale=scale),
-            **initialise("low", [self.obs_dim, *hidden, self.action_dim], stream, copies=k, output_scale=scale),
+            **initialise("high", [self.obs_dim, *hidden, (k + 1) * k], rng, output_scale=scale),
+            **initialise("low", [self.obs_dim, *hidden, self.action_dim], rng, copies=k, output_scale=scale),
             "log_deviations": torch.zeros(k, self.action_dim),
         }
 
@@ -118,21 +118,19 @@ class _Options(Standardised[Any]):
         policy = {name: tensor for name, tensor in parameters.items() if name.startswith(POLICY)}
         adapted = _copied(policy)
         descent = torch.optim.Adam(adapted.values(), lr=fine_tuning.learning_rate, fused=True)
-        steps = Steps.of(support, self.standardise)
+        steps = Steps.of(support, self.normalise)
         for _ in range(fine_tuning.steps):
             _step(descent, self._imitate(adapted, steps, "hard").loss)
-        return OptionPolicy(self._model({name: tensor.detach() for name, tensor in adapted.items()}), self.standardise)
+        return OptionPolicy(self._model({name: tensor.detach() for name, tensor in adapted.items()}), self.normalise)
 
     def _model(self, parameters: Parameters) -> OptionModel:
         return OptionModel.of(parameters, self.config.least_log_deviation)
 
-    def _draw(
-        self, demonstrations: Sequence[Demonstration], phase: Phase, stream: np.random.Generator
-    ) -> OptionMaterial:
+    def _draw(self, demonstrations: Sequence[Demonstration], phase: Phase, rng: np.random.Generator) -> OptionBatch:
         """Draw a slot's demonstrations, each at most once."""
         count = min(self.config.trajectories, len(demonstrations))
-        chosen = stream.choice(len(demonstrations), count, replace=False)
-        return OptionMaterial(tuple(demonstrations[index] for index in chosen), phase, int(stream.integers(2**63)))
+        chosen = rng.choice(len(demonstrations), count, replace=False)
+        return OptionBatch(tuple(demonstrations[index] for index in chosen), phase, int(rng.integers(2**63)))
 
     def _imitate(self, parameters: Parameters, steps: Steps, phase: Phase) -> _Imitated:
         """Return what EM goes down, per step: the E-step's weights are held fixed."""
@@ -167,65 +165,61 @@ class OptionGailOffline(_Options):
 
     config_type = OptionGailOfflineConfig
 
-    def sample(
-        self, demonstrations: Sequence[Demonstration], iteration: int, stream: np.random.Generator
-    ) -> OptionMaterial:
+    def sample(self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator) -> OptionBatch:
         """Draw whole demonstrations."""
         phase = "likelihood" if iteration < self.config.likelihood_iterations else "hard"
-        return self._draw(demonstrations, phase, stream)
+        return self._draw(demonstrations, phase, rng)
 
-    def task_gradient(self, parameters: Parameters, material: OptionMaterial) -> TaskGradient:
+    def task_gradient(self, parameters: Parameters, batch: OptionBatch) -> TaskGradient:
         """Return the gradient of −log p per step: of the actions, or of the actions and Viterbi's labels."""
         leaves = {name: tensor.detach().requires_grad_() for name, tensor in parameters.items()}
-        imitated = self._imitate(leaves, Steps.of(material.demonstrations, self.standardise), material.phase)
+        imitated = self._imitate(leaves, Steps.of(batch.demonstrations, self.normalise), batch.phase)
         gradients = torch.autograd.grad(imitated.loss, list(leaves.values()))
         return TaskGradient(flatten(dict(zip(leaves, gradients, strict=True))), imitated.metrics)
 
 
-class OptionGail(_Options):
+class OptionGail(_Options, OnlineMetaLearner[Any, OptionBatch]):
     """OptionGAIL for observations and actions of given sizes."""
 
     config_type = OptionGailConfig
 
-    def initial_parameters(self, stream: np.random.Generator) -> Parameters:
+    def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the option model, the critic V_L(s, o) and the discriminator."""
         k, critic, judge = self.config.sub_skills, self.config.critic_units, self.config.discriminator_units
         return {
-            **super().initial_parameters(stream),
-            **orthogonal("critic", [self.obs_dim, critic, critic, k], stream),
-            **orthogonal("discriminator", [self.obs_dim + self.action_dim, judge, judge, (k + 1) * k], stream),
+            **super().initial_parameters(rng),
+            **orthogonal("critic", [self.obs_dim, critic, critic, k], rng),
+            **orthogonal("discriminator", [self.obs_dim + self.action_dim, judge, judge, (k + 1) * k], rng),
         }
 
-    def practice_steps(self, iteration: int) -> int:
+    def environment_steps(self, iteration: int) -> int:
         """Return none before the adversarial iterations."""
         return 0 if iteration < self.config.offline_iterations else self.config.environment_steps
 
-    def sample(
-        self, demonstrations: Sequence[Demonstration], iteration: int, stream: np.random.Generator
-    ) -> OptionMaterial:
+    def sample(self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator) -> OptionBatch:
         """Draw whole demonstrations."""
         if iteration >= self.config.offline_iterations:
-            return self._draw(demonstrations, "adversarial", stream)
+            return self._draw(demonstrations, "adversarial", rng)
         phase = "likelihood" if iteration < self.config.likelihood_iterations else "hard"
-        return self._draw(demonstrations, phase, stream)
+        return self._draw(demonstrations, phase, rng)
 
-    def explorer(self, parameters: Parameters, material: OptionMaterial) -> OptionExplorer:
+    def exploration_policy(self, parameters: Parameters, batch: OptionBatch) -> OptionExplorationPolicy:
         """Return the option model, which acts at random."""
         model = self._model({name: tensor.detach() for name, tensor in parameters.items()})
-        return OptionExplorer(model, self.standardise, material.seed)
+        return OptionExplorationPolicy(model, self.normalise, batch.seed)
 
-    def with_practice(self, material: OptionMaterial, rollouts: Sequence[Rollout]) -> OptionMaterial:
+    def with_rollouts(self, batch: OptionBatch, rollouts: Sequence[Rollout]) -> OptionBatch:
         """Keep the rollouts that have a step."""
-        return replace(material, rollouts=tuple(rollout for rollout in rollouts if len(rollout.actions)))
+        return replace(batch, rollouts=tuple(rollout for rollout in rollouts if len(rollout.actions)))
 
-    def task_gradient(self, parameters: Parameters, material: OptionMaterial) -> TaskGradient:
+    def task_gradient(self, parameters: Parameters, batch: OptionBatch) -> TaskGradient:
         """Return the way that the slot's own steps of Adam went, before minus after."""
         moved = _copied(parameters)
-        demonstrated = Steps.of(material.demonstrations, self.standardise)
-        if material.phase == "adversarial":
-            metrics = self._play_round(moved, demonstrated, material)
+        demonstrated = Steps.of(batch.demonstrations, self.normalise)
+        if batch.phase == "adversarial":
+            metrics = self._play_round(moved, demonstrated, batch)
         else:
-            metrics = self._imitate_for_some_steps(moved, demonstrated, material.phase)
+            metrics = self._imitate_for_some_steps(moved, demonstrated, batch.phase)
         with torch.no_grad():
             return TaskGradient(flatten({name: parameters[name] - moved[name] for name in moved}), metrics)
 
@@ -239,19 +233,19 @@ class OptionGail(_Options):
             _step(descent, imitated.loss)
         return metrics[0]
 
-    def _play_round(self, moved: dict[str, Tensor], demonstrated: Steps, material: OptionMaterial) -> dict[str, float]:
+    def _play_round(self, moved: dict[str, Tensor], demonstrated: Steps, batch: OptionBatch) -> dict[str, float]:
         """Relabel, discriminate and improve in place, and return the metrics."""
-        generator, rollouts = torch.Generator().manual_seed(material.seed), material.rollouts
+        generator, rollouts = torch.Generator().manual_seed(batch.seed), batch.rollouts
         with torch.no_grad():
             labelled = self._imitate(moved, demonstrated, "hard")
         start = self.config.sub_skills
         expert = Played.of(demonstrated, labelled.pairs.sum(1).argmax(-1), start)
-        played = Played.of_rollouts(rollouts, self.standardise, start)
+        played = Played.of_rollouts(rollouts, self.normalise, start)
         judged = discriminate(moved, played, expert, self.config, generator)
         with torch.no_grad():
             rewards = imitation_rewards(discriminator_logits(moved, played, start))
         last = np.stack([rollout.observations[-1] for rollout in rollouts])
-        aims = aims_of(moved, played, rewards, torch.from_numpy(self.standardise(last)), self.config)
+        aims = aims_of(moved, played, rewards, torch.from_numpy(self.normalise(last)), self.config)
         return {
             **labelled.metrics,
             **judged,

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Int64
 
-from dmil_core.demonstrations import Demonstration, Standardisation
+from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.losses import Steps
 from dmil_core.methods.base import Decision, SubSkillUse
 from dmil_core.methods.option_gail.option_model import OptionModel
@@ -21,7 +21,7 @@ class OptionPolicy:
     """
 
     model: OptionModel
-    standardise: Standardisation
+    normalise: Normalisation
 
     def start(self, episodes: int) -> Int64[np.ndarray, "episodes 1"]:
         """Return the start symbol for each episode."""
@@ -32,7 +32,7 @@ class OptionPolicy:
         self, observations: Float32[np.ndarray, "episodes obs_dim"], memory: Int64[np.ndarray, "episodes 1"]
     ) -> Decision:
         """Choose an option and its mean action for each episode."""
-        states = torch.from_numpy(self.standardise(observations))
+        states = torch.from_numpy(self.normalise(observations))
         log_high = self.model.log_high(states)[torch.arange(len(states)), torch.from_numpy(memory[:, 0])]
         options = log_high.argmax(-1)
         return Decision(self.model.means(states, options).numpy(), options.numpy(), options.numpy()[:, None])
@@ -43,7 +43,7 @@ class OptionPolicy:
 
         The best fit is the option under which the action has the highest density, whatever came before.
         """
-        steps = Steps.of([demonstration], self.standardise)
+        steps = Steps.of([demonstration], self.normalise)
         chosen, last = [], self.model.options
         for choice in self.model.log_high(steps.states).argmax(-1).tolist():
             last = choice[last]
@@ -52,7 +52,7 @@ class OptionPolicy:
 
 
 @dataclass(frozen=True)
-class OptionExplorer(OptionPolicy):
+class OptionExplorationPolicy(OptionPolicy):
     """Options and actions drawn from the model.
 
     An episode's memory is its last option, how many steps it has gone, and its key. Its key is made of its number and
@@ -79,7 +79,7 @@ class OptionExplorer(OptionPolicy):
         uniform = torch.tensor([drawn for drawn, _ in draws])
         noise = torch.from_numpy(np.array([drawn for _, drawn in draws], np.float32).reshape(len(draws), -1))
 
-        states = torch.from_numpy(self.standardise(observations))
+        states = torch.from_numpy(self.normalise(observations))
         high = self.model.log_high(states)[torch.arange(len(states)), torch.from_numpy(last)].exp()
         # How many options lie wholly below the draw; rounding may leave the sum below 1.
         options = (high.cumsum(-1) < uniform[:, None]).sum(-1).clamp(max=self.model.options - 1)

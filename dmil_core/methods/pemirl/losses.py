@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from dmil_core.demonstrations import Demonstration, Standardisation
+from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.losses import Steps
 from dmil_core.networks import Parameters, mlp, network
 
@@ -58,9 +58,9 @@ class Transitions(NamedTuple):
     lengths: Int[Tensor, " trajectories"]
 
     @classmethod
-    def of(cls, demonstrations: Sequence[Demonstration], standardise: Standardisation) -> "Transitions":
+    def of(cls, demonstrations: Sequence[Demonstration], normalise: Normalisation) -> "Transitions":
         """Copy demonstrations into fresh tensors."""
-        states, actions, lengths = Steps.of(demonstrations, standardise)
+        states, actions, lengths = Steps.of(demonstrations, normalise)
         following, ends = torch.arange(len(states)) + 1, lengths.cumsum(0) - 1
         following[ends] = ends
         return cls(states, actions, states[following], lengths)

@@ -56,7 +56,7 @@ import torch
 from pydantic import Field
 
 from dmil_core.demonstrations import Demonstration, DemonstrationError
-from dmil_core.methods.base import FineTuning, Standardised, TaskGradient
+from dmil_core.methods.base import FineTuning, MetaLearner, TaskGradient
 from dmil_core.methods.behaviour_cloning.method import NetworkPolicy
 from dmil_core.methods.pemirl.losses import BOUND, Transitions, infer, losses_of
 from dmil_core.networks import Layer, Parameters, flatten, initialise, network
@@ -137,12 +137,12 @@ class ContextBatch:
         return tuple(demonstration.id for demonstration in (*self.contexts, *self.explained))
 
 
-class Pemirl(Standardised[PemirlConfig]):
+class Pemirl(MetaLearner[PemirlConfig, ContextBatch]):
     """PEMIRL for observations and actions of given sizes."""
 
     config_type = PemirlConfig
 
-    def initial_parameters(self, stream: np.random.Generator) -> Parameters:
+    def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the four models; only σ is set."""
         config = self.config
         of_policy, of_reward = (
@@ -157,13 +157,11 @@ class Pemirl(Standardised[PemirlConfig]):
         }
         drawn: dict[str, torch.Tensor] = {}
         for prefix, units in sizes.items():
-            drawn |= initialise(prefix, units, stream, output_scale=config.output_scale)
+            drawn |= initialise(prefix, units, rng, output_scale=config.output_scale)
         raw = BOUND * math.atanh(math.log(config.initial_deviation) / BOUND)
         return {**drawn, "log_deviation": torch.full((self.action_dim,), raw)}
 
-    def sample(
-        self, demonstrations: Sequence[Demonstration], iteration: int, stream: np.random.Generator
-    ) -> ContextBatch:
+    def sample(self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator) -> ContextBatch:
         """Draw the trajectories, all different where the task has as many, and name what is drawn later by a seed.
 
         Raises:
@@ -172,16 +170,16 @@ class Pemirl(Standardised[PemirlConfig]):
         if not demonstrations:
             raise DemonstrationError("demonstrations: got none for this task; wanted at least one; collect some first")
         contexts, wanted = self.config.contexts, self.config.contexts + self.config.trajectories
-        order = [stream.permutation(len(demonstrations)) for _ in range(-(-wanted // len(demonstrations)))]
+        order = [rng.permutation(len(demonstrations)) for _ in range(-(-wanted // len(demonstrations)))]
         drawn = [demonstrations[index] for index in np.concatenate(order)[:wanted]]
-        return ContextBatch(tuple(drawn[:contexts]), tuple(drawn[contexts:]), int(stream.integers(2**63)))
+        return ContextBatch(tuple(drawn[:contexts]), tuple(drawn[contexts:]), int(rng.integers(2**63)))
 
-    def task_gradient(self, parameters: Parameters, material: ContextBatch) -> TaskGradient:
+    def task_gradient(self, parameters: Parameters, batch: ContextBatch) -> TaskGradient:
         """Return the gradient of the weighted sum of all losses."""
-        config, generator = self.config, torch.Generator().manual_seed(material.seed)
+        config, generator = self.config, torch.Generator().manual_seed(batch.seed)
         contexts, explained = (
-            Transitions.of(demonstrations, self.standardise).thinned(config.steps_per_trajectory, generator)
-            for demonstrations in (material.contexts, material.explained)
+            Transitions.of(demonstrations, self.normalise).thinned(config.steps_per_trajectory, generator)
+            for demonstrations in (batch.contexts, batch.explained)
         )
         leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in parameters.items()}
         losses = losses_of(leaves, contexts, explained, config.discount, config.negatives, generator)
@@ -205,11 +203,11 @@ class Pemirl(Standardised[PemirlConfig]):
 
     def context(self, parameters: Parameters, support: Sequence[Demonstration]) -> torch.Tensor:
         """Return m of a support set: the mean of q_ψ's means over its demonstrations."""
-        return infer(parameters, Transitions.of(support, self.standardise)).mean.mean(0)
+        return infer(parameters, Transitions.of(support, self.normalise)).mean.mean(0)
 
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> NetworkPolicy:
         """Infer m; its part of the first layer's input is the same in every state, and so goes into the bias."""
         first, *others = network(parameters, "policy")
         of_states, of_context = first.weight.split([self.obs_dim, self.config.context_dim], 1)
         told = Layer(of_states, first.bias + of_context @ self.context(parameters, support))
-        return NetworkPolicy((told, *others), self.standardise)
+        return NetworkPolicy((told, *others), self.normalise)

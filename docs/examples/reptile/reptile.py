@@ -11,7 +11,7 @@ import torch
 
 from dmil_core.demonstrations import Demonstration
 from dmil_core.losses import Steps
-from dmil_core.methods.base import FineTuning, Standardised, TaskGradient
+from dmil_core.methods.base import FineTuning, MetaLearner, TaskGradient
 from dmil_core.methods.behaviour_cloning.method import NetworkPolicy, fine_tuned
 from dmil_core.networks import Network, Parameters, flatten, initialise, mlp, network
 from dmil_core.settings import Count, MethodConfig, Positive, Size
@@ -49,24 +49,24 @@ class Batch(NamedTuple):
         return [demonstration.id for demonstration in self.demonstrations]
 
 
-class Reptile(Standardised[ReptileConfig]):
+class Reptile(MetaLearner[ReptileConfig, Batch]):
     """Reptile for observations and actions of given sizes."""
 
     config_type = ReptileConfig
 
-    def initial_parameters(self, stream: np.random.Generator) -> Parameters:
+    def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the network."""
         units = self.config.hidden_units
-        return initialise("policy", [self.obs_dim, units, units, self.action_dim], stream, output_scale=0.1)
+        return initialise("policy", [self.obs_dim, units, units, self.action_dim], rng, output_scale=0.1)
 
-    def sample(self, demonstrations: Sequence[Demonstration], iteration: int, stream: np.random.Generator) -> Batch:
+    def sample(self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator) -> Batch:
         """Draw some demonstrations of the task: all that is random in an iteration is drawn here."""
-        chosen = stream.choice(len(demonstrations), min(self.config.trajectories, len(demonstrations)), replace=False)
+        chosen = rng.choice(len(demonstrations), min(self.config.trajectories, len(demonstrations)), replace=False)
         return Batch(tuple(demonstrations[index] for index in chosen))
 
-    def task_gradient(self, parameters: Parameters, material: Batch) -> TaskGradient:
+    def task_gradient(self, parameters: Parameters, batch: Batch) -> TaskGradient:
         """Return how far the task's own steps went, the other way round."""
-        before, steps = network(parameters, "policy"), Steps.of(material.demonstrations, self.standardise)
+        before, steps = network(parameters, "policy"), Steps.of(batch.demonstrations, self.normalise)
         after = self._descend(before, steps, FineTuning(self.config.inner_steps, self.config.inner_learning_rate))
         loss = (mlp(after, steps.states) - steps.actions).square().sum(-1).mean().item()
         way = [old - new for one, other in zip(before, after, strict=True) for old, new in zip(one, other, strict=True)]
@@ -74,8 +74,8 @@ class Reptile(Standardised[ReptileConfig]):
 
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> NetworkPolicy:
         """Take the same steps on the support set."""
-        steps = Steps.of(support, self.standardise)
-        return NetworkPolicy(self._descend(network(parameters, "policy"), steps, fine_tuning), self.standardise)
+        steps = Steps.of(support, self.normalise)
+        return NetworkPolicy(self._descend(network(parameters, "policy"), steps, fine_tuning), self.normalise)
 
     def _descend(self, policy: Network, steps: Steps, tuning: FineTuning) -> Network:
         return fine_tuned(policy, steps, torch.optim.SGD, tuning)

@@ -16,7 +16,7 @@ from dmil_core.methods.option_gail.method import (
 )
 from dmil_core.methods.option_gail.option_model import OptionModel
 from dmil_core.networks import Parameters
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 
 OFFLINE = OptionGailOfflineConfig(hidden_layers=2, hidden_units=8, trajectories=3, likelihood_iterations=2)
 PLAYING = OptionGailConfig(
@@ -90,7 +90,7 @@ def rollouts() -> list[Rollout]:
 def drawn_parameters(method: OptionGailOffline | OptionGail) -> Parameters:
     """Draw parameters of which none is zero."""
     generator = torch.Generator().manual_seed(1)
-    drawn = method.initial_parameters(stream(0, "initial"))
+    drawn = method.initial_parameters(named_rng(0, "initial"))
     return {name: tensor + 0.3 * torch.randn(tensor.shape, generator=generator) for name, tensor in drawn.items()}
 
 

@@ -15,7 +15,7 @@ from dmil_core.methods.base import FineTuning, MetaLearner, Policy
 from dmil_core.methods.behaviour_cloning.method import BehaviourCloning, BehaviourCloningConfig, PerTask, PerTaskConfig
 from dmil_core.methods.nearest_neighbour.method import NearestNeighbour, NearestNeighbourConfig
 from dmil_core.networks import flatten, unflatten
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 from tests.dmil_core.methods.toys import meta_trained, record, training_sets
 
 SMALL: dict[str, Any] = {"hidden_layers": 2, "hidden_units": 16}
@@ -48,26 +48,26 @@ def plain_loss(vector: torch.Tensor, shapes, steps: Steps) -> torch.Tensor:
 
 
 def test_the_gradient_is_that_of_the_error_on_all_that_was_drawn(cloning, demonstrations) -> None:
-    parameters = cloning.initial_parameters(stream(0, "initial"))
-    material = cloning.sample(demonstrations, 0, stream(0, "batch"))
-    steps = Steps.of(list(itertools.chain(*material.sets)), cloning.standardise)
+    parameters = cloning.initial_parameters(named_rng(0, "initial"))
+    batch = cloning.sample(demonstrations, 0, named_rng(0, "batch"))
+    steps = Steps.of(list(itertools.chain(*batch.sets)), cloning.normalise)
     assert len(steps.lengths) == 8
     vector = flatten(parameters).requires_grad_()
     loss = plain_loss(vector, {name: tensor.shape for name, tensor in parameters.items()}, steps)
     (wanted,) = torch.autograd.grad(loss, vector)
-    found = cloning.task_gradient(parameters, material)
+    found = cloning.task_gradient(parameters, batch)
     torch.testing.assert_close(found.gradient, wanted)
     assert found.metrics["loss"] == pytest.approx(loss.item(), rel=1e-5)
 
 
 def test_fine_tuning_is_plain_gradient_descent_on_the_support_set(cloning, demonstrations) -> None:
-    parameters, support = cloning.initial_parameters(stream(0, "initial")), demonstrations[:2]
+    parameters, support = cloning.initial_parameters(named_rng(0, "initial")), demonstrations[:2]
     before = flatten(parameters)
     policy = cloning.adapt(parameters, support, FineTuning(3, 0.05))
     vector, shapes = before.clone(), {name: tensor.shape for name, tensor in parameters.items()}
     for _ in range(3):
         vector.requires_grad_()
-        loss = plain_loss(vector, shapes, Steps.of(support, cloning.standardise))
+        loss = plain_loss(vector, shapes, Steps.of(support, cloning.normalise))
         vector = (vector - 0.05 * torch.autograd.grad(loss, vector)[0]).detach()
     found = flatten({f"{n}.{k}": t for n, layer in enumerate(policy.network) for k, t in layer._asdict().items()})
     torch.testing.assert_close(found, vector)
@@ -83,7 +83,7 @@ def test_cloning_all_tasks_helps_a_new_one() -> None:
     training = TrainingConfig(iterations=200, tasks_per_iteration=4, learning_rate=1e-2)
     parameters = meta_trained(cloning, sets, training)
     scratch = PerTask.prepared(PerTaskConfig(**SMALL), 2, everything)
-    fresh = scratch.initial_parameters(stream(0, "initial"))
+    fresh = scratch.initial_parameters(named_rng(0, "initial"))
     for task in (100, 101):
         demonstrations, _ = record(task, 8)
         support, others = demonstrations[:2], demonstrations[2:]
@@ -96,14 +96,14 @@ def test_cloning_all_tasks_helps_a_new_one() -> None:
 def test_the_nearest_state_tells_what_to_do(demonstrations) -> None:
     method = NearestNeighbour.prepared(NearestNeighbourConfig(), 3, demonstrations)
     assert not isinstance(method, MetaLearner)
-    assert method.initial_parameters(stream(0, "initial")) == {}
+    assert method.initial_parameters(named_rng(0, "initial")) == {}
     policy = method.adapt({}, demonstrations[:3], FineTuning(5, 0.1))
     known = demonstrations[1].observations
     assert np.array_equal(policy.act(known, policy.start(len(known))).actions, demonstrations[1].actions)
     seen = np.concatenate([one.observations for one in demonstrations[:3]])
     did = np.concatenate([one.actions for one in demonstrations[:3]])
-    asked = stream(0, "asked").normal(size=(20, 4)).astype(np.float32)
-    scaled = [((state - seen) / method.standardise.scale) for state in asked]
+    asked = named_rng(0, "asked").normal(size=(20, 4)).astype(np.float32)
+    scaled = [((state - seen) / method.normalise.scale) for state in asked]
     wanted = did[[int(np.square(way).sum(1).argmin()) for way in scaled]]
     assert np.array_equal(policy.act(asked, policy.start(20)).actions, wanted)
     assert not policy.sub_skill_use(demonstrations[0]).chosen.any()

@@ -9,8 +9,8 @@ import torch
 from dmil_core.methods.ppo import (
     clipped_surrogate,
     generalised_advantages,
+    normalised,
     scaled,
-    standardised,
     trajectory_advantages,
 )
 
@@ -105,5 +105,5 @@ def test_advantages_are_the_discounted_sums_of_surprises(discount: float, trace:
 def test_rewards_are_scaled_and_advantages_standardised() -> None:
     draws = torch.tensor([-3.0, -4.0, 0.0, 5.0])
     np.testing.assert_allclose(scaled(draws), draws / (50 / 4) ** 0.5, rtol=1e-6)
-    np.testing.assert_allclose(standardised(draws), (draws + 0.5) / 12.25**0.5, rtol=1e-6)
-    assert scaled(torch.zeros(2)).tolist() == standardised(torch.full((2,), 3.0)).tolist() == [0.0, 0.0]
+    np.testing.assert_allclose(normalised(draws), (draws + 0.5) / 12.25**0.5, rtol=1e-6)
+    assert scaled(torch.zeros(2)).tolist() == normalised(torch.full((2,), 3.0)).tolist() == [0.0, 0.0]

@@ -43,8 +43,8 @@ def test_methods_of_packages_stand_behind_ours(install) -> None:
     [
         ("import nowhere", "which cannot be imported: ModuleNotFoundError: No module named 'nowhere'; wanted what the"),
         ("", "which cannot be imported: AttributeError: module 'faulty_package' has no attribute 'Nearest'; wanted"),
-        ("Nearest = 3", "got 3; wanted a class derived from Standardised; see docs/your-own-method.md"),
-        ("class Nearest: ...", "wanted a class derived from Standardised"),
+        ("Nearest = 3", "got 3; wanted a class derived from Method; see docs/your-own-method.md"),
+        ("class Nearest: ...", "wanted a class derived from Method"),
     ],
 )
 def test_a_fault_of_a_package_is_told_in_words(install, code: str, said: str) -> None:

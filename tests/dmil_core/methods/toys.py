@@ -13,8 +13,8 @@ from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import Decision, MetaLearner, Policy, Rollout
 from dmil_core.networks import Parameters, flatten, unflatten
-from dmil_core.outer_loop import OuterState, OuterStep, Practise, group_gradient, groups, tasks_of
-from dmil_core.seeding import stream
+from dmil_core.outer_loop import CollectRollouts, OuterState, OuterStep, group_gradient, groups, tasks_of
+from dmil_core.seeding import named_rng
 
 STEPS, SPEED = 40, 0.05
 DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0]])
@@ -30,7 +30,7 @@ class Recorded(NamedTuple):
 
 def _task(number: int) -> tuple[int, float]:
     """Return which skill comes first, and the line where the other takes over."""
-    return number % 2, float(stream(number, "line").uniform(-0.3, 0.3))
+    return number % 2, float(named_rng(number, "line").uniform(-0.3, 0.3))
 
 
 def _start(random: np.random.Generator) -> np.ndarray:
@@ -46,7 +46,7 @@ def record(task: int, episodes: int) -> Recorded:
     """Demonstrate a task."""
     demonstrations, skills = [], []
     for episode in range(episodes):
-        place, places, actions, acted = _start(stream(task, "start", episode)), [], [], []
+        place, places, actions, acted = _start(named_rng(task, "start", episode)), [], [], []
         for _ in range(STEPS):
             skill = _skill(task, place)
             places.append(place)
@@ -75,11 +75,11 @@ def act_along(policy: Policy, demonstration: Demonstration) -> list[Decision]:
     return decisions
 
 
-def practise(policy: Policy, task: str, seed: int, steps: int) -> list[Rollout]:
+def collect_rollouts(policy: Policy, task: str, seed: int, steps: int) -> list[Rollout]:
     """Let a policy act in a task, `steps` in all; it succeeds where at the end it stands where the expert would."""
     number, rollouts, left = int(task.removeprefix("task-")), [], steps
     while left > 0:
-        place = expert = _start(stream(seed, "start", len(rollouts)))
+        place = expert = _start(named_rng(seed, "start", len(rollouts)))
         memory, places, actions, chosen = policy.start(1), [place], [], []
         for _ in range(min(STEPS, left)):
             decision = policy.act(place[None].astype(np.float32), memory)
@@ -100,20 +100,20 @@ def practise(policy: Policy, task: str, seed: int, steps: int) -> list[Rollout]:
 
 
 def meta_trained(
-    method: MetaLearner[Any],
+    method: MetaLearner[Any, Any],
     sets: dict[str, Sequence[Demonstration]],
     training: TrainingConfig,
-    practise: Practise = practise,
+    collect_rollouts: CollectRollouts = collect_rollouts,
 ) -> Parameters:
     """Meta-train in this process, from seed 0, and return the parameters."""
-    initial = method.initial_parameters(stream(0, "initial parameters"))
+    initial = method.initial_parameters(named_rng(0, "initial parameters"))
     shapes = {name: tensor.shape for name, tensor in initial.items()}
     step = OuterStep(OuterState.start(flatten(initial).numpy()), training)
     for iteration in range(training.iterations):
         tasks = tasks_of(iteration, list(sets), 0, training.tasks_per_iteration)
         (slots,) = groups(training.model_copy(update={"slots_per_group": training.tasks_per_iteration}))
         parameters = unflatten(step.parameters, shapes)
-        step(group_gradient(method, sets, parameters, 0, iteration, tasks, slots, practise).gradient)
+        step(group_gradient(method, sets, parameters, 0, iteration, tasks, slots, collect_rollouts).gradient)
     return unflatten(step.parameters, shapes)
 
 

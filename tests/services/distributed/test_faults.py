@@ -108,19 +108,19 @@ def test_a_hung_worker_is_overtaken_and_the_log_says_so(
 @pytest.mark.usefixtures("joined")
 def test_a_slot_that_ends_its_workers_is_named(small: Experiment, data):
     class Deadly(Dmil):
-        def task_gradient(self, parameters, material):
-            if material.task == "push" and len(list(folder.iterdir())) >= 2:
+        def task_gradient(self, parameters, batch):
+            if batch.task == "push" and len(list(folder.iterdir())) >= 2:
                 os.kill(os.getpid(), signal.SIGSEGV)
-            if material.task == "push":
+            if batch.task == "push":
                 (folder / str(time.time())).touch()
-            return super().task_gradient(parameters, material)
+            return super().task_gradient(parameters, batch)
 
     plan = plan_of(small, data)
     folder = small.store.root / "seen"
     folder.mkdir()
     method = plan.method
     assert isinstance(method, Dmil)
-    deadly = plan._replace(method=Deadly(method.config, method.action_dim, method.standardise))
+    deadly = plan._replace(method=Deadly(method.config, method.action_dim, method.normalise))
     with open_runner("ray", small.suite, 2) as runner:
         meta_training = runner.meta_train(deadly)
         with pytest.raises(WorkError, match=r"iteration \d, slot \d, task push, seed 0: .*3 workers ended") as error:
@@ -209,11 +209,11 @@ class FailingDmil(Dmil):
 
     calls = 0
 
-    def task_gradient(self, parameters, material):
+    def task_gradient(self, parameters, batch):
         FailingDmil.calls += 1
-        if FailingDmil.calls > 2 * 3 and material.task == "push":
+        if FailingDmil.calls > 2 * 3 and batch.task == "push":
             raise ArithmeticError("out of numbers")
-        return super().task_gradient(parameters, material)
+        return super().task_gradient(parameters, batch)
 
 
 def test_an_error_is_told_with_the_command_that_repeats_it(
@@ -243,15 +243,15 @@ def test_an_error_is_told_with_the_command_that_repeats_it(
 @pytest.mark.usefixtures("joined")
 def test_an_error_in_a_worker_arrives_whole(small: Experiment, data):
     class Failing(Dmil):
-        def task_gradient(self, parameters, material):
-            if material.task == "push":
+        def task_gradient(self, parameters, batch):
+            if batch.task == "push":
                 raise ArithmeticError("out of numbers")
-            return super().task_gradient(parameters, material)
+            return super().task_gradient(parameters, batch)
 
     plan = plan_of(small, data)
     method = plan.method
     assert isinstance(method, Dmil)
-    failing = plan._replace(method=Failing(method.config, method.action_dim, method.standardise))
+    failing = plan._replace(method=Failing(method.config, method.action_dim, method.normalise))
     with open_runner("ray", small.suite, 2) as runner:
         meta_training = runner.meta_train(failing)
         with pytest.raises(WorkError, match=r"iteration 1, slot .*, task push.*: ArithmeticError: out of n") as error:

@@ -18,14 +18,14 @@ from dmil_core.methods.base import (
     FineTuning,
     Flat,
     MetaLearner,
+    OnlineMetaLearner,
     Policy,
-    PractisingLearner,
     Rollout,
 )
 from dmil_core.methods.behaviour_cloning.method import NetworkPolicy
 from dmil_core.methods.registry import OURS, method_type
 from dmil_core.networks import initialise, network, unflatten
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 from services import meta_train
 from services.demonstrations.store import DemoStore
 from services.distributed.ray_meta_training import RayMetaTraining
@@ -38,7 +38,7 @@ from tests.services.distributed.courses import alone, assert_same_bits, follow, 
 
 PROJECT = Path(__file__).parents[3]
 LEARNERS = [name for name, kind in OURS.items() if issubclass(kind, MetaLearner)]
-PRACTISING = [name for name in LEARNERS if issubclass(OURS[name], PractisingLearner)]
+PRACTISING = [name for name in LEARNERS if issubclass(OURS[name], OnlineMetaLearner)]
 
 
 def smoke(method: str, iterations: int) -> ExperimentConfig:
@@ -121,8 +121,8 @@ def test_a_slot_is_a_pure_function(store: DemoStore, data, method: str):
     assert isinstance(learner, MetaLearner)
     found = []
     for _ in range(2):
-        material = learner.sample(sets["push"], 0, stream(3, "batch"))
-        found.append(learner.task_gradient(parameters, material))
+        batch = learner.sample(sets["push"], 0, named_rng(3, "batch"))
+        found.append(learner.task_gradient(parameters, batch))
         torch.rand(3)
     assert torch.equal(found[0].gradient, found[1].gradient)
     assert found[0].metrics == found[1].metrics
@@ -137,7 +137,7 @@ def test_constants_and_a_single_step_are_enough_to_act(experiment: Experiment, d
     sets = experiment.training_sets(data)
     made = kind.prepared(settings, suite.action_dim, sets["push"])
     again = kind.restored(settings, suite.action_dim, made.constants())
-    parameters = made.initial_parameters(stream(0, "initial"))
+    parameters = made.initial_parameters(named_rng(0, "initial"))
     step = sets["push"][0].window(0, 1)
     tuning = tuning_of(method)
     observations = sets["reach"][0].observations[:5]
@@ -164,14 +164,14 @@ def tuning_of(method: str) -> FineTuning:
 @pytest.fixture
 def wanderer(experiment: Experiment, data) -> Policy:
     method = experiment.method(experiment.training_sets(data))
-    random = initialise("policy", [method.obs_dim, 16, method.action_dim], stream(0, "wanderer"))
-    return NetworkPolicy(network(random, "policy"), method.standardise)
+    random = initialise("policy", [method.obs_dim, 16, method.action_dim], named_rng(0, "wanderer"))
+    return NetworkPolicy(network(random, "policy"), method.normalise)
 
 
 def test_practice_is_a_pure_function_that_takes_its_steps(experiment: Experiment, wanderer: Policy):
     worker = SimulationWorker(experiment.suite)
-    found: list[list[Rollout]] = [worker.practise(wanderer, "push", 7, 700) for _ in range(2)]
-    other = worker.practise(wanderer, "push", 8, 700)
+    found: list[list[Rollout]] = [worker.collect_rollouts(wanderer, "push", 7, 700) for _ in range(2)]
+    other = worker.collect_rollouts(wanderer, "push", 8, 700)
     lengths = [len(rollout.actions) for rollout in found[0]]
     assert sum(lengths) == 700
     assert lengths == [300, 300, 100]
@@ -200,7 +200,7 @@ class Replay(Flat):
 
 def test_practice_ends_an_episode_at_its_success(experiment: Experiment, data):
     task, worker = "drawer-close", SimulationWorker(experiment.suite)
-    rollouts = worker.practise(Replay(data[task].demonstrations[0]), task, 0, 650)
+    rollouts = worker.collect_rollouts(Replay(data[task].demonstrations[0]), task, 0, 650)
     assert sum(len(rollout.actions) for rollout in rollouts) == 650
     solved = [rollout for rollout in rollouts if rollout.success]
     assert solved

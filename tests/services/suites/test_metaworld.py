@@ -9,7 +9,7 @@ from metaworld.evaluation import evaluation
 from metaworld.sawyer_xyz_env import SawyerXYZEnv
 
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
-from dmil_core.seeding import stream_seed
+from dmil_core.seeding import named_seed
 from services.rollouts.episodes import demonstrate
 from services.suites.metaworld import (
     SPLITS,
@@ -76,7 +76,7 @@ def test_goals_of_meta_testing_are_unseen_in_meta_training():
     env = MetaWorldSuite(SuiteConfig(name="ML1-reach")).make_env("reach")
 
     def goals(*key: str) -> set[tuple[float, ...]]:
-        return {tuple(env.reset(seed=stream_seed(0, *key, "reach", index))[1]["goal"]) for index in range(25)}
+        return {tuple(env.reset(seed=named_seed(0, *key, "reach", index))[1]["goal"]) for index in range(25)}
 
     seen, unseen = goals("demonstration"), goals("evaluation")
     assert len(seen) == len(unseen) == 25
@@ -187,14 +187,14 @@ def test_a_hidden_goal_is_zero_and_the_rest_is_equal(task):
     visible, hidden = (MetaWorldSuite(SuiteConfig(goal_visible=shown)).make_env(task) for shown in (True, False))
     (seen, info), (unseen, hidden_info) = (env.reset(seed=3) for env in (visible, hidden))
     assert info["goal"] == hidden_info["goal"]
-    stream = np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     for _ in range(30):
         assert unseen.shape == seen.shape
         assert np.array_equal(unseen[:-3], seen[:-3])
         assert not unseen[-3:].any()
         assert seen[-3:].any()
         assert np.array_equal(hidden_info["full_observation"], seen)
-        action = stream.uniform(-1, 1, 4).astype(np.float32)
+        action = rng.uniform(-1, 1, 4).astype(np.float32)
         seen, *_, info = visible.step(action)
         unseen, *_, hidden_info = hidden.step(action)
         assert hidden_info["success"] == info["success"]
@@ -206,11 +206,11 @@ def test_hidden_goals_are_hidden_as_meta_world_hides_them(task):
     stock._freeze_rand_vec, stock.seeded_rand_vec = False, True
     theirs = SeededEpisodes(stock)
     ours = MetaWorldSuite(SuiteConfig(goal_visible=False)).make_env(task)
-    stream = np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     (one, _), (other, _) = (env.reset(seed=4) for env in (theirs, ours))
     for _ in range(20):
         assert np.array_equal(one, other)
-        action = stream.uniform(-1, 1, 4).astype(np.float32)
+        action = rng.uniform(-1, 1, 4).astype(np.float32)
         (one, *_), (other, *_) = (env.step(action) for env in (theirs, ours))
 
 

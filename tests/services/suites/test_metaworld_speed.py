@@ -37,7 +37,7 @@ def compare(task: str, envs: list[Env], seed: int, *, with_expert: bool) -> bool
 
     The second computes rewards, the others do not.
     """
-    expert, stream = ENV_POLICY_MAP[f"{task}-v3"](), np.random.default_rng(seed)
+    expert, rng = ENV_POLICY_MAP[f"{task}-v3"](), np.random.default_rng(seed)
     resets = [env.reset(seed=seed) for env in envs]
     observation = resets[0][0]
     assert {bits(each) for each, _ in resets} == {bits(observation)}
@@ -47,7 +47,7 @@ def compare(task: str, envs: list[Env], seed: int, *, with_expert: bool) -> bool
         if with_expert:
             action = np.clip(expert.get_action(observation.copy()), -1, 1).astype(np.float32)
         else:
-            action = stream.uniform(-1, 1, 4).astype(np.float32)
+            action = rng.uniform(-1, 1, 4).astype(np.float32)
         stock, rewarded, *others = (env.step(action) for env in envs)
         observation, reward, terminated, truncated, info = stock
         assert {bits(each[0]) for each in (rewarded, *others)} == {bits(observation)}, f"differs at step {step}"
@@ -83,13 +83,13 @@ def test_success_is_judged_alike_wherever_the_object_is(task: str):
     stock, fast = stock_env(task), MetaWorldSuite(SuiteConfig()).make_env(task)
     observation, _ = stock.reset(seed=1)
     fast.reset(seed=1)
-    stream = np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     target, action = observation[-3:], np.zeros(4, np.float32)
     judge: list[Any] = [stock.unwrapped, fast.unwrapped]
     for scale in np.repeat([0.01, 0.03, 0.1], 40):
         around = observation.copy()
         for part in (slice(4, 7), slice(11, 14), slice(0, 3)):
-            around[part] = target + stream.normal(0, scale, 3)
+            around[part] = target + rng.normal(0, scale, 3)
         verdicts = [env.evaluate_state(around.copy(), action)[1]["success"] for env in judge]
         assert verdicts[0] == verdicts[1]
 
@@ -134,9 +134,9 @@ def test_an_episode_ends_where_meta_world_ends_it():
 
 
 def test_quaternions_are_those_of_scipy_to_the_bit():
-    stream = np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     turns = [Rotation.from_matrix(matrix) for matrix in (np.eye(3), np.diag([1.0, -1, -1]), np.diag([-1.0, -1, 1]))]
-    turns += [Rotation.from_quat(stream.normal(size=4)) for _ in range(2000)]
+    turns += [Rotation.from_quat(rng.normal(size=4)) for _ in range(2000)]
     for turn in turns:
         matrix = turn.as_matrix()
         assert quaternion(matrix).tobytes() == Rotation.from_matrix(matrix).as_quat().tobytes()

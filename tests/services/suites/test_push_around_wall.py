@@ -296,12 +296,12 @@ def test_the_fast_environment_is_equal_to_the_bit():
     stock, rewarded, fast = envs = stock_env(), make_env(rewards=True), make_env()
     solved = []
     for seed in range(4):
-        stream = np.random.default_rng(seed)
+        rng = np.random.default_rng(seed)
         observations = [env.reset(seed=seed)[0] for env in envs]
         successes = 0
         for _ in range(180):
             action = PushAroundWallExpert().get_action(observations[0].copy())
-            noisy = action + stream.normal(0, 0.1, 4) if seed < 3 else stream.uniform(-1, 1, 4)
+            noisy = action + rng.normal(0, 0.1, 4) if seed < 3 else rng.uniform(-1, 1, 4)
             steps = [env.step(np.clip(noisy, -1, 1).astype(np.float32)) for env in (stock, rewarded, fast)]
             observations = [step[0] for step in steps]
             assert len({observation.tobytes() for observation in observations}) == 1

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dmil_core.demonstrations import Demonstration, Standardisation
+from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.methods.base import FineTuning
 from dmil_core.methods.mil.config import MilConfig
 from dmil_core.methods.mil.losses import (
@@ -22,17 +22,17 @@ from dmil_core.methods.mil.losses import (
 from dmil_core.methods.mil.method import Mil
 from dmil_core.methods.mil.transformer import cached, decode, encode
 from dmil_core.networks import Parameters, flatten, unflatten
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 from tests.dmil_core.methods.conftest import SMALL_MIL
 
 
 @pytest.fixture
 def parameters() -> Parameters:
-    return Mil(SMALL_MIL, 3, Standardisation.identity(4)).initial_parameters(stream(0, "initial"))
+    return Mil(SMALL_MIL, 3, Normalisation.identity(4)).initial_parameters(named_rng(0, "initial"))
 
 
 def support_of(demonstrations: list[Demonstration], config: MilConfig = SMALL_MIL) -> Support:
-    identity = Standardisation.identity(demonstrations[0].observations.shape[1])
+    identity = Normalisation.identity(demonstrations[0].observations.shape[1])
     return Support.of(demonstrations, identity, config.positions, config.units)
 
 
@@ -112,13 +112,13 @@ def test_no_path_leads_from_an_action_to_its_own_prediction(parameters, make_dem
 def test_only_what_is_not_hidden_can_be_copied() -> None:
     """Actions are random, and others in each iteration: only who sees them knows them."""
     config = SMALL_MIL.model_copy(update={"units": 32, "key_units": 16, "value_units": 16, "feed_forward_units": 32})
-    method = Mil(config, 2, Standardisation.identity(3))
+    method = Mil(config, 2, Normalisation.identity(3))
 
     def trained(hide: bool) -> float:
         leaves = {
-            name: tensor.requires_grad_() for name, tensor in method.initial_parameters(stream(0, "initial")).items()
+            name: tensor.requires_grad_() for name, tensor in method.initial_parameters(named_rng(0, "initial")).items()
         }
-        adam, random, losses = torch.optim.Adam(leaves.values(), lr=3e-3), stream(0, "actions"), []
+        adam, random, losses = torch.optim.Adam(leaves.values(), lr=3e-3), named_rng(0, "actions"), []
         for _ in range(600):
             states, actions = (random.uniform(-1, 1, (6, size)).astype(np.float32) for size in (3, 2))
             support = support_of([Demonstration("d", "t", states, actions)], config)

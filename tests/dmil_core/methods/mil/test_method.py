@@ -8,15 +8,15 @@ import pytest
 import torch
 
 from dmil_core.configs import TrainingConfig
-from dmil_core.demonstrations import Demonstration, DemonstrationError, Standardisation
+from dmil_core.demonstrations import Demonstration, DemonstrationError, Normalisation
 from dmil_core.methods.base import FineTuning, MetaLearner
 from dmil_core.methods.mil.losses import Support, inner_loss
 from dmil_core.methods.mil.method import Mil, MilBatch, MilConfig
 from dmil_core.methods.mil.transformer import cached, decode, encode
 from dmil_core.networks import Parameters, flatten
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 from tests.dmil_core.methods.conftest import SMALL_MIL
-from tests.dmil_core.methods.toys import meta_trained, practise, record, training_sets
+from tests.dmil_core.methods.toys import collect_rollouts, meta_trained, record, training_sets
 
 Order = Literal["first", "second"]
 ORDERS = pytest.mark.parametrize("order", ["first", "second"])
@@ -34,12 +34,12 @@ def method(demonstrations) -> Mil:
 
 @pytest.fixture
 def parameters(method) -> Parameters:
-    return method.initial_parameters(stream(0, "initial"))
+    return method.initial_parameters(named_rng(0, "initial"))
 
 
 def test_the_paper_s_sizes() -> None:
-    method = Mil(MilConfig(), 4, Standardisation.identity(39))
-    parameters = method.initial_parameters(stream(0, "initial"))
+    method = Mil(MilConfig(), 4, Normalisation.identity(39))
+    parameters = method.initial_parameters(named_rng(0, "initial"))
     attention, norms, feed_forward = 4 * 512 * 512, 4 * 512, 2 * 512 * 2048 + 2048 + 512
     layers = 6 * (attention + norms + feed_forward) + 2 * 2 * 512
     inputs = (39 + 4 + 1) * 512 + 512 + 3 * 512 + (39 + 1) * 512
@@ -61,7 +61,7 @@ def test_sizes_are_settings(size: str) -> None:
 def test_a_sample_has_support_and_query_of_different_demonstrations(method, demonstrations) -> None:
     seen = []
     for iteration in range(60):
-        batch = method.sample(demonstrations, iteration, stream(0, "batch", iteration))
+        batch = method.sample(demonstrations, iteration, named_rng(0, "batch", iteration))
         support = [demonstration.id for demonstration in batch.support]
         assert list(batch.ids) == support + list(batch.query_ids)
         assert not set(support) & set(batch.query_ids)
@@ -85,35 +85,35 @@ def test_a_sample_has_support_and_query_of_different_demonstrations(method, demo
 def test_query_pairs_are_drawn_evenly_from_all_steps(make_demonstrations) -> None:
     demonstrations = make_demonstrations(0, [2, 30, 10])
     config = SMALL_MIL.model_copy(update={"shots": 1, "batch_pairs": 1})
-    method = Mil(config, 3, Standardisation.identity(4))
+    method = Mil(config, 3, Normalisation.identity(4))
     counts: dict[str, int] = dict.fromkeys(("d0", "d1", "d2"), 0)
     for draw in range(900):
-        batch = method.sample(demonstrations, 0, stream(0, "batch", draw))
+        batch = method.sample(demonstrations, 0, named_rng(0, "batch", draw))
         counts[batch.query_ids[0]] += batch.support[0].id == "d0"
     assert counts["d0"] == 0
     assert abs(counts["d1"] / (counts["d1"] + counts["d2"]) - 0.75) < 0.1
 
 
 def test_a_task_needs_two_demonstrations(method, demonstrations) -> None:
-    batch = method.sample(demonstrations[:2], 0, stream(0, "batch"))
+    batch = method.sample(demonstrations[:2], 0, named_rng(0, "batch"))
     assert sorted(batch.ids) == ["d0", "d1"]
     with pytest.raises(DemonstrationError, match="got 1 for this task; wanted at least 2"):
-        method.sample(demonstrations[:1], 0, stream(0, "batch"))
+        method.sample(demonstrations[:1], 0, named_rng(0, "batch"))
 
 
 def test_first_and_second_order_differ(method, parameters, demonstrations) -> None:
-    batch = method.sample(demonstrations, 0, stream(0, "batch"))
+    batch = method.sample(demonstrations, 0, named_rng(0, "batch"))
     gradients = []
     for order in ("first", "second"):
-        other = Mil(SMALL_MIL.model_copy(update={"order": order}), 3, method.standardise)
+        other = Mil(SMALL_MIL.model_copy(update={"order": order}), 3, method.normalise)
         gradients.append(other.task_gradient(parameters, batch).gradient)
     assert not torch.allclose(*gradients, rtol=1e-2)
 
 
 @ORDERS
 def test_a_task_gradient_is_pure(method, parameters, demonstrations, order: Order) -> None:
-    method = Mil(SMALL_MIL.model_copy(update={"order": order}), 3, method.standardise)
-    batch = method.sample(demonstrations, 0, stream(0, "batch"))
+    method = Mil(SMALL_MIL.model_copy(update={"order": order}), 3, method.normalise)
+    batch = method.sample(demonstrations, 0, named_rng(0, "batch"))
     before, state = flatten(parameters), torch.get_rng_state()
     one = method.task_gradient(parameters, batch)
     torch.manual_seed(1)
@@ -128,7 +128,7 @@ def test_a_task_gradient_is_pure(method, parameters, demonstrations, order: Orde
 
 
 def test_dropout_is_in_the_outer_loss_alone(method, parameters, demonstrations) -> None:
-    batch = method.sample(demonstrations, 0, stream(0, "batch"))
+    batch = method.sample(demonstrations, 0, named_rng(0, "batch"))
     other = MilBatch(batch.support, batch.observations, batch.actions, batch.query_ids, batch.seed + 1)
     one, two = method.task_gradient(parameters, batch), method.task_gradient(parameters, other)
     assert one.metrics["inner_loss"] == two.metrics["inner_loss"]
@@ -140,8 +140,8 @@ def test_dropout_is_in_the_outer_loss_alone(method, parameters, demonstrations) 
 def test_a_single_step_can_be_learned_from(make_demonstrations, order: Order) -> None:
     demonstrations = make_demonstrations(0, [1] * 4)
     method = Mil.prepared(SMALL_MIL.model_copy(update={"order": order}), 3, demonstrations)
-    parameters = method.initial_parameters(stream(0, "initial"))
-    found = method.task_gradient(parameters, method.sample(demonstrations, 0, stream(0, "batch")))
+    parameters = method.initial_parameters(named_rng(0, "initial"))
+    found = method.task_gradient(parameters, method.sample(demonstrations, 0, named_rng(0, "batch")))
     assert found.gradient.isfinite().all()
     assert found.gradient.any()
     assert all(np.isfinite(value) for value in found.metrics.values())
@@ -155,7 +155,7 @@ def test_adaptation_is_the_inner_loop(method, parameters, demonstrations, steps:
     before = flatten(parameters)
     policy = method.adapt(parameters, demonstrations[:3], FineTuning(steps, 0.1))
     assert torch.equal(flatten(parameters), before)
-    support = Support.of(demonstrations[:3], method.standardise, SMALL_MIL.positions, SMALL_MIL.units)
+    support = Support.of(demonstrations[:3], method.normalise, SMALL_MIL.positions, SMALL_MIL.units)
     expected = dict(parameters)
     for _ in range(steps):
         leaves = {name: tensor.detach().requires_grad_() for name, tensor in expected.items()}
@@ -165,7 +165,7 @@ def test_adaptation_is_the_inner_loop(method, parameters, demonstrations, steps:
     assert torch.equal(flatten(policy.parameters), before) == (steps == 0)
     cache = cached(expected, encode(expected, *support, 2), 2)
     observations = demonstrations[3].observations
-    actions = decode(expected, torch.from_numpy(method.standardise(observations)), cache)
+    actions = decode(expected, torch.from_numpy(method.normalise(observations)), cache)
     decision = policy.act(observations, policy.start(len(observations)))
     np.testing.assert_allclose(decision.actions, actions.numpy(), rtol=1e-5, atol=1e-6)
     assert decision.actions.dtype == np.float32
@@ -220,6 +220,6 @@ def test_learns_to_imitate_new_tasks() -> None:
             decision = policy.act(one.observations, policy.start(len(one)))
             errors.append(np.square(decision.actions - one.actions).sum(1).mean())
             naive.append(np.square(mean - one.actions).sum(1).mean())
-        successes += [rollout.success for rollout in practise(policy, f"task-{task}", 1, 5 * 40)]
+        successes += [rollout.success for rollout in collect_rollouts(policy, f"task-{task}", 1, 5 * 40)]
     assert np.mean(errors) < 0.3 * np.mean(naive)
     assert np.mean(successes) >= 0.8

@@ -22,7 +22,7 @@ from dmil_core.methods.mil.transformer import (
     position_encoding,
 )
 from dmil_core.networks import Parameters, flatten, unflatten
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 
 SIZES = Sizes(
     obs_dim=5,
@@ -42,7 +42,7 @@ def drawn(sizes: Sizes = SIZES, seed: int = 0) -> Parameters:
     generator = torch.Generator().manual_seed(seed)
     return {
         name: (tensor + 0.3 * torch.randn(tensor.shape, generator=generator)).double()
-        for name, tensor in initialise(sizes, stream(seed, "initial")).items()
+        for name, tensor in initialise(sizes, named_rng(seed, "initial")).items()
     }
 
 
@@ -175,7 +175,7 @@ def test_every_part_of_a_layer_has_dropout(part: str) -> None:
 
 def test_initial_parameters_survive_flattening_and_keep_the_variance() -> None:
     sizes = SIZES._replace(units=64, feed_forward_units=256)
-    parameters = initialise(sizes, stream(0, "initial"), output_scale=0.5)
+    parameters = initialise(sizes, named_rng(0, "initial"), output_scale=0.5)
     back = unflatten(flatten(parameters), {name: tensor.shape for name, tensor in parameters.items()})
     assert all(torch.equal(back[name], tensor) for name, tensor in parameters.items())
     for name, tensor in parameters.items():

@@ -17,7 +17,7 @@ from dmil_core.methods.mlsh.macro_steps import draw_batch, macro_steps
 from dmil_core.methods.mlsh.method import Mlsh
 from dmil_core.methods.ppo import clipped_surrogate
 from dmil_core.networks import flatten, mlp, unflatten
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 from tests.dmil_core.methods.conftest import SMALL_MLSH
 from tests.dmil_core.methods.toys import act_along, meta_trained, record, recovered, training_sets
 
@@ -41,7 +41,7 @@ def test_it_is_a_meta_learner(method) -> None:
 
 
 def test_initial_parameters_are_the_bank_with_a_value_each(method) -> None:
-    shapes = {name: tuple(tensor.shape) for name, tensor in method.initial_parameters(stream(0, "initial")).items()}
+    shapes = {name: tuple(tensor.shape) for name, tensor in method.initial_parameters(named_rng(0, "initial")).items()}
     assert shapes == {
         "low.0.weight": (3, 8, 4),
         "low.0.bias": (3, 8),
@@ -65,33 +65,33 @@ def test_the_sizes_are_settings(size: str) -> None:
 
 
 def test_a_sample_is_of_different_demonstrations(method, demonstrations) -> None:
-    one, two = (method.sample(demonstrations, 0, stream(0, "batch", slot)) for slot in range(2))
+    one, two = (method.sample(demonstrations, 0, named_rng(0, "batch", slot)) for slot in range(2))
     assert len(one.ids) == len(set(one.ids)) == SMALL_MLSH.trajectories
     assert one.ids != two.ids
     assert one.seed != two.seed
-    assert len(method.sample(demonstrations[:2], 0, stream(0, "batch")).ids) == 2
+    assert len(method.sample(demonstrations[:2], 0, named_rng(0, "batch")).ids) == 2
     with pytest.raises(DemonstrationError, match="got none"):
-        method.sample([], 0, stream(0, "batch"))
+        method.sample([], 0, named_rng(0, "batch"))
 
 
 def test_a_task_gradient_is_the_same_bits_again_and_leaves_the_parameters(method, demonstrations) -> None:
-    parameters = method.initial_parameters(stream(0, "initial"))
-    before, material = flatten(parameters), method.sample(demonstrations, 0, stream(0, "batch"))
+    parameters = method.initial_parameters(named_rng(0, "initial"))
+    before, batch = flatten(parameters), method.sample(demonstrations, 0, named_rng(0, "batch"))
     torch.manual_seed(0)
-    one = method.task_gradient(parameters, material)
+    one = method.task_gradient(parameters, batch)
     torch.manual_seed(1)
-    two = method.task_gradient(parameters, material)
+    two = method.task_gradient(parameters, batch)
     assert torch.equal(one.gradient, two.gradient)
     assert one.metrics == two.metrics
     assert torch.equal(flatten(parameters), before)
-    other = method.task_gradient(parameters, method.sample(demonstrations, 0, stream(1, "batch")))
+    other = method.task_gradient(parameters, method.sample(demonstrations, 0, named_rng(1, "batch")))
     assert not torch.equal(one.gradient, other.gradient)
 
 
 def test_parameters_minus_the_gradient_are_where_the_slot_arrived(demonstrations, monkeypatch) -> None:
     """One joint update is one step of Adam from zero moments: each number goes by the learning rate, or not at all."""
     method = Mlsh.prepared(SMALL_MLSH.model_copy(update={"joint_updates": 1}), 3, demonstrations)
-    parameters = method.initial_parameters(stream(0, "initial"))
+    parameters = method.initial_parameters(named_rng(0, "initial"))
     learned = []
 
     class Watched(mlsh._Learning):
@@ -101,7 +101,7 @@ def test_parameters_minus_the_gradient_are_where_the_slot_arrived(demonstrations
                 learned.append(flatten({n: t.detach() for n, t in self.parameters.items()}))
 
     monkeypatch.setattr(mlsh, "_Learning", Watched)
-    gradient = method.task_gradient(parameters, method.sample(demonstrations, 0, stream(0, "batch"))).gradient
+    gradient = method.task_gradient(parameters, method.sample(demonstrations, 0, named_rng(0, "batch"))).gradient
     assert len(learned) == 1
     torch.testing.assert_close(flatten(parameters) - gradient, learned[-1], rtol=0, atol=1e-6)
     assert gradient.abs().max() <= SMALL_MLSH.sub_skill_learning_rate * 1.01
@@ -109,8 +109,8 @@ def test_parameters_minus_the_gradient_are_where_the_slot_arrived(demonstrations
 
 
 def test_the_metrics_are_those_of_the_policy_of_the_slot(method, demonstrations) -> None:
-    parameters = method.initial_parameters(stream(0, "initial"))
-    found = method.task_gradient(parameters, method.sample(demonstrations, 0, stream(0, "batch")))
+    parameters = method.initial_parameters(named_rng(0, "initial"))
+    found = method.task_gradient(parameters, method.sample(demonstrations, 0, named_rng(0, "batch")))
     metrics = found.metrics
     assert sum(metrics[f"sub_skill_share/{k}"] for k in range(3)) == pytest.approx(1)
     assert 0 <= metrics["loss_of_best"] <= metrics["loss"]
@@ -133,7 +133,7 @@ def test_as_many_updates_as_asked_in_passes_over_each_batch(method, demonstratio
 
     monkeypatch.setattr(mlsh, "_Learning", Counted)
     monkeypatch.setattr(mlsh, "draw_batch", counted)
-    method.adapt(method.initial_parameters(stream(0, "initial")), demonstrations[:1], FineTuning(updates, 1e-3))
+    method.adapt(method.initial_parameters(named_rng(0, "initial")), demonstrations[:1], FineTuning(updates, 1e-3))
     assert len(taken) == updates
     assert batches == list(range(0, updates, SMALL_MLSH.passes))
 
@@ -142,7 +142,7 @@ def test_at_a_batchs_first_update_the_loss_of_the_high_level_is_plain_policy_gra
     """ρ = 1: the gradient is that of −mean A log π(z) + c mean (V − R)², R_m = −Σ of the errors in m, scaled."""
     config = SMALL_MLSH.model_copy(update={"value_weight": 0.7})
     method = Mlsh.prepared(config, 3, demonstrations)
-    steps = Steps.of(demonstrations[:3], method.standardise)  # 19 steps: macro-steps of 3, 3, 1 | 3 | 3, 3, 3
+    steps = Steps.of(demonstrations[:3], method.normalise)  # 19 steps: macro-steps of 3, 3, 1 | 3 | 3, 3, 3
     task = mlsh._Task(steps, config, generator())
     high = method._fresh_high(np.random.default_rng(0), 1e-3)
     picks = task._pick(high, steps.states, steps.lengths)
@@ -167,8 +167,8 @@ def test_a_joint_update_goes_down_the_policy_gradients_of_both_levels(demonstrat
     """Against plain autograd on the same draws, each step run on all sub-skills and picked from."""
     config = SMALL_MLSH.model_copy(update={"value_weight": 0.7, "batch_size": 19})
     method = Mlsh.prepared(config, 3, demonstrations)
-    steps = Steps.of(demonstrations[:3], method.standardise)  # 19 steps: one batch takes each trajectory once
-    bank = mlsh._Learning(method.initial_parameters(stream(0, "initial")), 1e-4)
+    steps = Steps.of(demonstrations[:3], method.normalise)  # 19 steps: one batch takes each trajectory once
+    bank = mlsh._Learning(method.initial_parameters(named_rng(0, "initial")), 1e-4)
     high = method._fresh_high(np.random.default_rng(0), 1e-3)
     levels = [high, bank]
     before = [
@@ -213,7 +213,7 @@ def _standard(advantages: torch.Tensor) -> torch.Tensor:
 
 def test_sub_skills_are_drawn_as_often_as_the_high_level_says(demonstrations) -> None:
     method = Mlsh.prepared(SMALL_MLSH, 3, demonstrations)
-    task = mlsh._Task(Steps.of(demonstrations, method.standardise), SMALL_MLSH, generator())
+    task = mlsh._Task(Steps.of(demonstrations, method.normalise), SMALL_MLSH, generator())
     high = method._fresh_high(np.random.default_rng(0), 1e-3)
     with torch.no_grad():
         high.parameters["high.2.weight"].zero_()
@@ -225,9 +225,9 @@ def test_sub_skills_are_drawn_as_often_as_the_high_level_says(demonstrations) ->
 
 
 def test_parameters_that_are_not_finite_are_reported_and_not_raised(method, demonstrations) -> None:
-    initial = method.initial_parameters(stream(0, "initial"))
+    initial = method.initial_parameters(named_rng(0, "initial"))
     parameters = {name: torch.full_like(tensor, torch.nan) for name, tensor in initial.items()}
-    found = method.task_gradient(parameters, method.sample(demonstrations, 0, stream(0, "batch")))
+    found = method.task_gradient(parameters, method.sample(demonstrations, 0, named_rng(0, "batch")))
     assert found.gradient.isnan().any()
 
 
@@ -235,7 +235,7 @@ def test_sub_skills_go_down_the_expected_squared_error(demonstrations) -> None:
     """Averaged over what is drawn, the surrogate's gradient at ρ = 1 is that of E r = −‖μ − a‖² − dσ², without V."""
     config = SMALL_MLSH.model_copy(update={"deviation": 0.2})
     method = Mlsh.prepared(config, 3, demonstrations)
-    steps = Steps.of(demonstrations[:1], method.standardise)
+    steps = Steps.of(demonstrations[:1], method.normalise)
     task = mlsh._Task(steps, config, generator())
     means = torch.randn(7, 3, generator=generator(1)).requires_grad_()
     (expected,) = torch.autograd.grad(-(means - steps.actions).square().sum(-1).mean(), means)
@@ -258,8 +258,8 @@ def test_it_learns_from_one_step_or_ragged_trajectories(
 ) -> None:
     demonstrations = make_demonstrations(0, lengths)
     method = Mlsh.prepared(SMALL_MLSH.model_copy(update={"discount": discount}), 3, demonstrations)
-    parameters = method.initial_parameters(stream(0, "initial"))
-    found = method.task_gradient(parameters, method.sample(demonstrations, 0, stream(0, "batch")))
+    parameters = method.initial_parameters(named_rng(0, "initial"))
+    found = method.task_gradient(parameters, method.sample(demonstrations, 0, named_rng(0, "batch")))
     assert torch.isfinite(found.gradient).all()
     assert found.gradient.any()
     assert all(np.isfinite(value) for value in found.metrics.values())
@@ -268,11 +268,11 @@ def test_it_learns_from_one_step_or_ragged_trajectories(
 
 
 def test_the_bits_do_not_depend_on_where_the_parameters_lie(method, demonstrations) -> None:
-    parameters = method.initial_parameters(stream(0, "initial"))
+    parameters = method.initial_parameters(named_rng(0, "initial"))
     shapes = {name: tensor.shape for name, tensor in parameters.items()}
     views = [unflatten(flatten(parameters), shapes) for _ in range(2)]
-    material = method.sample(demonstrations, 0, stream(0, "batch"))
-    one, two = (method.task_gradient(view, material).gradient for view in views)
+    batch = method.sample(demonstrations, 0, named_rng(0, "batch"))
+    one, two = (method.task_gradient(view, batch).gradient for view in views)
     assert torch.equal(one, two)
 
 

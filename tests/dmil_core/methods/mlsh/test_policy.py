@@ -12,7 +12,7 @@ from dmil_core.methods.mlsh import method as mlsh
 from dmil_core.methods.mlsh.config import MlshConfig
 from dmil_core.methods.mlsh.method import Mlsh, MlshPolicy
 from dmil_core.networks import flatten, mlp
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 from tests.dmil_core.methods.conftest import SMALL_MLSH
 from tests.dmil_core.methods.toys import act_along
 
@@ -25,10 +25,10 @@ def method(demonstrations) -> Mlsh:
 @pytest.fixture
 def policy(method) -> MlshPolicy:
     """Return a policy of random networks, its choice anything but constant."""
-    bank = method.initial_parameters(stream(1, "initial"))
+    bank = method.initial_parameters(named_rng(1, "initial"))
     adapted = method.adapt(bank, [demonstration_of(np.zeros((1, 4)))], FineTuning(0, 0.1))
-    high = mlsh.network(mlsh.initialise("high", [4, 8, 3], stream(0, "high")), "high")
-    return MlshPolicy(high, adapted.low, adapted.macro_step, adapted.standardise)
+    high = mlsh.network(mlsh.initialise("high", [4, 8, 3], named_rng(0, "high")), "high")
+    return MlshPolicy(high, adapted.low, adapted.macro_step, adapted.normalise)
 
 
 def demonstration_of(observations: np.ndarray) -> Demonstration:
@@ -48,7 +48,7 @@ def test_a_sub_skill_is_held_for_a_macro_step_and_then_chosen_anew(policy) -> No
             acted[episode].append((decision.sub_skills[row], decision.actions[row]))
     switches = 0
     for episode, steps in enumerate(acted):
-        states = torch.from_numpy(policy.standardise(observations[episode]))
+        states = torch.from_numpy(policy.normalise(observations[episode]))
         modes = mlp(policy.high, states).argmax(-1).tolist()
         chosen = [int(sub_skill) for sub_skill, _ in steps]
         assert chosen == [modes[t - t % 3] for t in range(len(steps))]
@@ -77,7 +77,7 @@ def test_sub_skill_use_is_the_choice_along_the_demonstration_and_the_best_fit(po
     demonstration = Demonstration("d", "reach", observations, actions)
     use = policy.sub_skill_use(demonstration)
     assert use.chosen.tolist() == [decision.sub_skills.item() for decision in act_along(policy, demonstration)]
-    states = torch.from_numpy(policy.standardise(observations))
+    states = torch.from_numpy(policy.normalise(observations))
     errors = [np.square(mlp(sub_skill, states).numpy() - actions).sum(1) for sub_skill in policy.low]
     assert use.best.tolist() == np.argmin(errors, axis=0).tolist()
     assert len(set(use.best.tolist())) > 1
@@ -90,7 +90,7 @@ def test_no_episode_is_an_answer_too(policy) -> None:
 
 
 def test_adaptation_learns_a_high_level_and_leaves_the_sub_skills(method, demonstrations) -> None:
-    parameters = method.initial_parameters(stream(0, "initial"))
+    parameters = method.initial_parameters(named_rng(0, "initial"))
     before = flatten(parameters)
     policies = [method.adapt(parameters, demonstrations[:2], FineTuning(steps, 0.1)) for steps in (0, 4, 4)]
     assert torch.equal(flatten(parameters), before)
@@ -115,7 +115,7 @@ def test_a_fresh_high_level_finds_the_better_sub_skill(make_demonstrations) -> N
     config = MlshConfig(sub_skills=2, hidden_layers=1, hidden_units=32, batch_size=270)
     method = Mlsh.prepared(config, 3, [demonstration])
     parameters = {
-        name: torch.zeros_like(tensor) for name, tensor in method.initial_parameters(stream(0, "initial")).items()
+        name: torch.zeros_like(tensor) for name, tensor in method.initial_parameters(named_rng(0, "initial")).items()
     }
     parameters["low.1.bias"][1, :3] = 1.0
     policy = method.adapt(parameters, [demonstration], FineTuning(300, 1e-2))

@@ -21,14 +21,14 @@ from dmil_core.methods.option_gail.adversary import (
 )
 from dmil_core.methods.option_gail.method import OptionGail
 from dmil_core.methods.option_gail.option_model import options_before
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 from tests.dmil_core.methods.conftest import PLAYING, drawn_parameters, model_of
-from tests.dmil_core.methods.toys import STEPS, practise, record
+from tests.dmil_core.methods.toys import STEPS, collect_rollouts, record
 
 
 @pytest.fixture
 def played(playing, rollouts) -> Played:
-    return Played.of_rollouts(rollouts, playing.standardise, 3)
+    return Played.of_rollouts(rollouts, playing.normalise, 3)
 
 
 def test_orthogonal_weights_keep_lengths() -> None:
@@ -51,7 +51,7 @@ def test_rollouts_lie_one_after_the_other(playing, played, rollouts) -> None:
     assert played.steps.lengths.tolist() == [5, 1, 3]
     assert [played.before[t].item() for t in (0, 5, 6)] == [3, 3, 3]
     assert torch.equal(played.before, options_before(played.options, played.steps.lengths, 3))
-    np.testing.assert_allclose(played.steps.states[6:], playing.standardise(rollouts[2].observations[:3]))
+    np.testing.assert_allclose(played.steps.states[6:], playing.normalise(rollouts[2].observations[:3]))
     np.testing.assert_allclose(played.steps.actions[6:], rollouts[2].actions)
     some = played.at(torch.tensor([6, 1]))
     assert some.before.tolist() == [3, played.options[0].item()]
@@ -68,7 +68,7 @@ def test_logits_are_indexed_by_the_option_before_and_at(playing, played, plain_m
 
 
 def test_the_discriminator_learns_to_tell_them_apart(playing, played, demonstrations) -> None:
-    steps = Steps.of(demonstrations, playing.standardise)
+    steps = Steps.of(demonstrations, playing.normalise)
     expert = Played.of(steps._replace(actions=steps.actions + 3), torch.zeros(len(steps.states), dtype=torch.int64), 3)
     config = PLAYING.model_copy(update={"discriminator_passes": 100, "learning_rate": 1e-2})
     moved = {name: tensor.clone().requires_grad_() for name, tensor in drawn_parameters(playing).items()}
@@ -85,7 +85,7 @@ def test_the_discriminator_learns_to_tell_them_apart(playing, played, demonstrat
 def test_aims_follow_from_the_values_of_both_levels(playing, played, rollouts) -> None:
     parameters, discount, both = drawn_parameters(playing), PLAYING.discount, PLAYING.discount * PLAYING.smoothing
     rewards = torch.rand(9, generator=torch.Generator().manual_seed(0))
-    beyond = torch.from_numpy(playing.standardise(np.stack([one.observations[-1] for one in rollouts])))
+    beyond = torch.from_numpy(playing.normalise(np.stack([one.observations[-1] for one in rollouts])))
     found = aims_of(parameters, played, rewards, beyond, PLAYING)
 
     with torch.no_grad():
@@ -136,21 +136,23 @@ def test_improvement_follows_the_advantages_of_each_level(playing, played) -> No
 
 @pytest.mark.usefixtures("unchecked")
 def test_practice_improves_a_known_reward() -> None:
-    """The explorer, the advantages and PPO, with a reward in place of the discriminator's: where to go, and how."""
+    """Exploration, advantages and PPO learn a known reward, in place of the discriminator's: where to go, and how."""
     demonstrations = record(0, 2).demonstrations
     config = PLAYING.model_copy(
         update={"sub_skills": 2, "hidden_layers": 1, "hidden_units": 16, "output_scale": 0.1}
         | {"learning_rate": 3e-3, "minibatch": 64, "policy_epochs": 4, "discount": 0.9}
     )
     method = OptionGail.prepared(config, 2, demonstrations)
-    moved = {name: tensor.requires_grad_() for name, tensor in method.initial_parameters(stream(0, "initial")).items()}
+    moved = {
+        name: tensor.requires_grad_() for name, tensor in method.initial_parameters(named_rng(0, "initial")).items()
+    }
     means = []
     for iteration in range(25):
-        material = method.sample(demonstrations, config.offline_iterations, stream(0, "batch", iteration))
-        rollouts = practise(method.explorer(moved, material), "task-0", iteration, 5 * STEPS)
-        played = Played.of_rollouts(rollouts, method.standardise, 2)
+        batch = method.sample(demonstrations, config.offline_iterations, named_rng(0, "batch", iteration))
+        rollouts = collect_rollouts(method.exploration_policy(moved, batch), "task-0", iteration, 5 * STEPS)
+        played = Played.of_rollouts(rollouts, method.normalise, 2)
         rewards = -(played.steps.actions - torch.tensor([-1.0, 0.5])).square().sum(1) + 2.0 * (played.options == 1)
-        last = torch.from_numpy(method.standardise(np.stack([one.observations[-1] for one in rollouts])))
+        last = torch.from_numpy(method.normalise(np.stack([one.observations[-1] for one in rollouts])))
         aims = aims_of(moved, played, rewards, last, config)
         improve(moved, played, aims, config, torch.Generator().manual_seed(iteration))
         means.append(rewards.mean().item())

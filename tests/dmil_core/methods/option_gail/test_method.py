@@ -10,19 +10,19 @@ from torch.distributions import Normal
 
 from dmil_core.configs import SIZES, EvaluationConfig, TrainingConfig
 from dmil_core.losses import Steps
-from dmil_core.methods.base import FineTuning, MetaLearner, Policy, PractisingLearner, Rollout
+from dmil_core.methods.base import FineTuning, MetaLearner, OnlineMetaLearner, Policy, Rollout
 from dmil_core.methods.option_gail.method import (
+    OptionBatch,
     OptionGail,
     OptionGailConfig,
     OptionGailOffline,
     OptionGailOfflineConfig,
-    OptionMaterial,
 )
 from dmil_core.methods.option_gail.option_model import Chain, log_likelihood, viterbi
 from dmil_core.networks import Parameters, flatten, unflatten
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 from tests.dmil_core.methods.conftest import OFFLINE, PLAYING, drawn_parameters, model_of
-from tests.dmil_core.methods.toys import STEPS, meta_trained, practise, record, recovered, training_sets
+from tests.dmil_core.methods.toys import STEPS, collect_rollouts, meta_trained, record, recovered, training_sets
 
 
 def like(gradient: torch.Tensor, parameters: Parameters) -> Parameters:
@@ -31,8 +31,8 @@ def like(gradient: torch.Tensor, parameters: Parameters) -> Parameters:
 
 def test_they_are_what_their_types_say(offline, playing) -> None:
     assert isinstance(offline, MetaLearner)
-    assert not isinstance(offline, PractisingLearner)
-    assert isinstance(playing, PractisingLearner)
+    assert not isinstance(offline, OnlineMetaLearner)
+    assert isinstance(playing, OnlineMetaLearner)
 
 
 @pytest.mark.parametrize("size", ["paper", "quick", "smoke"])
@@ -83,9 +83,9 @@ def test_initial_parameters_have_the_sizes_of_the_settings(offline, playing) -> 
         "discriminator.2.bias": (12,),
     }
     for method, expected in ((offline, model), (playing, model | others)):
-        drawn = method.initial_parameters(stream(0, "initial"))
+        drawn = method.initial_parameters(named_rng(0, "initial"))
         assert {name: tuple(tensor.shape) for name, tensor in drawn.items()} == expected
-        again = method.initial_parameters(stream(0, "initial"))
+        again = method.initial_parameters(named_rng(0, "initial"))
         assert torch.equal(flatten(drawn), flatten(again))
 
 
@@ -94,22 +94,24 @@ def test_initial_parameters_have_the_sizes_of_the_settings(offline, playing) -> 
     [(0, "likelihood", 0), (1, "likelihood", 0), (2, "hard", 0), (3, "hard", 0), (4, "adversarial", 9)],
 )
 def test_an_iteration_decides_of_the_phase(offline, playing, demonstrations, iteration, phase, steps) -> None:
-    material = playing.sample(demonstrations, iteration, stream(0, "batch"))
-    assert material.phase == phase
-    assert playing.practice_steps(iteration) == steps
-    assert len(set(material.ids)) == 3
-    assert offline.sample(demonstrations, iteration, stream(0, "batch")).phase == phase.replace("adversarial", "hard")
-    assert len(offline.sample(demonstrations[:2], iteration, stream(0, "batch")).ids) == 2
+    batch = playing.sample(demonstrations, iteration, named_rng(0, "batch"))
+    assert batch.phase == phase
+    assert playing.environment_steps(iteration) == steps
+    assert len(set(batch.ids)) == 3
+    assert offline.sample(demonstrations, iteration, named_rng(0, "batch")).phase == phase.replace(
+        "adversarial", "hard"
+    )
+    assert len(offline.sample(demonstrations[:2], iteration, named_rng(0, "batch")).ids) == 2
 
 
 def test_gradient_is_that_of_the_likelihood(offline, demonstrations) -> None:
     parameters = {name: tensor.requires_grad_() for name, tensor in drawn_parameters(offline).items()}
-    material = offline.sample(demonstrations, 0, stream(0, "batch"))
-    steps, model = Steps.of(material.demonstrations, offline.standardise), model_of(parameters)
+    batch = offline.sample(demonstrations, 0, named_rng(0, "batch"))
+    steps, model = Steps.of(batch.demonstrations, offline.normalise), model_of(parameters)
     chain = Chain.of(model.log_high(steps.states), model.log_low(steps.states, steps.actions), steps.lengths)
     loss = -log_likelihood(chain).sum() / len(steps.states)
     expected = torch.autograd.grad(loss, list(parameters.values()))
-    found = offline.task_gradient(parameters, material)
+    found = offline.task_gradient(parameters, batch)
     assert found.metrics["loss"] == pytest.approx(loss.item(), rel=1e-5)
     assert sum(found.metrics[f"sub_skill_share/{k}"] for k in range(3)) == pytest.approx(1)
     for of, gradient in zip(like(found.gradient, parameters).values(), expected, strict=True):
@@ -118,8 +120,8 @@ def test_gradient_is_that_of_the_likelihood(offline, demonstrations) -> None:
 
 def test_gradient_of_hard_em_is_that_of_the_labelled_demonstrations(offline, demonstrations, plain_mlp) -> None:
     parameters = {name: tensor.requires_grad_() for name, tensor in drawn_parameters(offline).items()}
-    material = offline.sample(demonstrations, 2, stream(0, "batch"))
-    steps, model = Steps.of(material.demonstrations, offline.standardise), model_of(parameters)
+    batch = offline.sample(demonstrations, 2, named_rng(0, "batch"))
+    steps, model = Steps.of(batch.demonstrations, offline.normalise), model_of(parameters)
     labels = viterbi(
         Chain.of(model.log_high(steps.states), model.log_low(steps.states, steps.actions), steps.lengths)
     ).tolist()
@@ -130,7 +132,7 @@ def test_gradient_of_hard_em_is_that_of_the_labelled_demonstrations(offline, dem
         mean = plain_mlp(model.low[label], steps.states[t])
         total = total + Normal(mean, model.log_deviations[label].exp()).log_prob(steps.actions[t]).sum()
     loss = -total / len(labels)
-    found = offline.task_gradient(parameters, material)
+    found = offline.task_gradient(parameters, batch)
     assert found.metrics["loss"] == pytest.approx(loss.item(), rel=1e-5)
     assert [found.metrics[f"sub_skill_share/{k}"] for k in range(3)] == pytest.approx(
         [labels.count(k) / len(labels) for k in range(3)]
@@ -144,10 +146,10 @@ def test_gradient_of_hard_em_is_that_of_the_labelled_demonstrations(offline, dem
 @pytest.mark.parametrize("iteration", [0, 2])
 def test_an_offline_slot_goes_one_step_of_adam(offline, playing, demonstrations, iteration: int) -> None:
     parameters = drawn_parameters(playing)
-    material = playing.sample(demonstrations, iteration, stream(0, "batch"))
+    batch = playing.sample(demonstrations, iteration, named_rng(0, "batch"))
     model = {name: tensor for name, tensor in parameters.items() if not name.startswith(("critic", "discriminator"))}
-    slopes = like(offline.task_gradient(model, material).gradient, model)
-    found = playing.task_gradient(parameters, material)
+    slopes = like(offline.task_gradient(model, batch).gradient, model)
+    found = playing.task_gradient(parameters, batch)
     for name, way in like(found.gradient, parameters).items():
         slope = slopes.get(name)
         if slope is None:
@@ -165,11 +167,11 @@ def test_a_single_step_can_be_learned_from(make_demonstrations, rollouts, iterat
         OptionGailOffline.prepared(OFFLINE, 3, demonstrations),
         OptionGail.prepared(PLAYING, 3, demonstrations),
     ):
-        parameters = method.initial_parameters(stream(0, "initial"))
-        material = method.sample(demonstrations, iteration, stream(0, "batch"))
-        if isinstance(method, OptionGail) and method.practice_steps(iteration):
-            material = method.with_practice(material, rollouts)
-        found = method.task_gradient(parameters, material)
+        parameters = method.initial_parameters(named_rng(0, "initial"))
+        batch = method.sample(demonstrations, iteration, named_rng(0, "batch"))
+        if isinstance(method, OptionGail) and method.environment_steps(iteration):
+            batch = method.with_rollouts(batch, rollouts)
+        found = method.task_gradient(parameters, batch)
         assert torch.isfinite(found.gradient).all()
         assert found.gradient.any()
         assert all(np.isfinite(value) for value in found.metrics.values())
@@ -189,7 +191,7 @@ def test_adaptation_leaves_the_parameters(playing, demonstrations, steps: int) -
 
 
 def test_adaptation_raises_the_likelihood_of_the_support(offline, demonstrations) -> None:
-    parameters, steps = drawn_parameters(offline), Steps.of(demonstrations[:2], offline.standardise)
+    parameters, steps = drawn_parameters(offline), Steps.of(demonstrations[:2], offline.normalise)
     found = []
     for count in (0, 20):
         model = offline.adapt(parameters, demonstrations[:2], FineTuning(count, 0.01)).model
@@ -203,9 +205,9 @@ def test_a_round_is_pure_and_reports_what_it_took(playing, demonstrations, rollo
     before = flatten(parameters)
     empty = Rollout(np.zeros((1, 4), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.int64), False, False)
 
-    def of_seed(seed: int) -> OptionMaterial:
-        material = replace(playing.sample(demonstrations, 4, stream(0, "batch")), seed=seed)
-        return playing.with_practice(material, [rollouts[0], empty, *rollouts[1:]])
+    def of_seed(seed: int) -> OptionBatch:
+        batch = replace(playing.sample(demonstrations, 4, named_rng(0, "batch")), seed=seed)
+        return playing.with_rollouts(batch, [rollouts[0], empty, *rollouts[1:]])
 
     found, again, other = (playing.task_gradient(parameters, of_seed(seed)) for seed in (1, 1, 2))
     assert torch.equal(flatten(parameters), before)
@@ -229,7 +231,7 @@ def test_tells_two_skills_apart_in_a_new_task_offline() -> None:
     demonstrations, skills = record(101, 8)
     policy = method.adapt(parameters, demonstrations[:2], FineTuning(100, 1e-2))
     assert recovered(skills, [policy.sub_skill_use(one).chosen for one in demonstrations]) >= 0.95
-    successes = [rollout.success for rollout in practise(policy, "task-101", 5, 10 * STEPS)]
+    successes = [rollout.success for rollout in collect_rollouts(policy, "task-101", 5, 10 * STEPS)]
     assert np.mean(successes) >= 0.9
 
 
@@ -259,7 +261,7 @@ def test_practice_against_the_discriminator_makes_more_of_a_poor_start() -> None
     successes: list[float] = []
 
     def watched(policy: Policy, task: str, seed: int, steps: int) -> list[Rollout]:
-        rollouts = practise(policy, task, seed, steps)
+        rollouts = collect_rollouts(policy, task, seed, steps)
         successes.append(float(np.mean([rollout.success for rollout in rollouts])))
         return rollouts
 

@@ -125,10 +125,10 @@ def test_the_option_before_is_the_start_at_each_first_step() -> None:
 
 @pytest.fixture
 def parameters() -> Parameters:
-    stream = np.random.default_rng(3)
+    rng = np.random.default_rng(3)
     return {
-        **initialise("high", [4, 8, 12], stream),
-        **initialise("low", [4, 8, 2], stream, copies=3),
+        **initialise("high", [4, 8, 12], rng),
+        **initialise("low", [4, 8, 2], rng, copies=3),
         "log_deviations": torch.tensor([[0.5, -1.0], [-3.0, 0.0], [-25.0, -0.5]]),
     }
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dmil_core.demonstrations import Demonstration, Standardisation
+from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.methods.pemirl.losses import (
     Gaussian,
     Losses,
@@ -24,7 +24,7 @@ from dmil_core.methods.pemirl.losses import (
 )
 from dmil_core.methods.pemirl.method import Pemirl, PemirlConfig
 from dmil_core.networks import Parameters, network
-from dmil_core.seeding import stream
+from dmil_core.seeding import named_rng
 
 SMALL = PemirlConfig(
     hidden_layers=2,
@@ -54,7 +54,7 @@ def demonstrations(make_demonstrations) -> list[Demonstration]:
 
 @pytest.fixture
 def method(demonstrations) -> Pemirl:
-    return Pemirl(SMALL, action_dim=3, standardise=Standardisation.of(demonstrations))
+    return Pemirl(SMALL, action_dim=3, normalise=Normalisation.of(demonstrations))
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def parameters(method) -> Parameters:
     generator = torch.Generator().manual_seed(3)
     return {
         name: (tensor + 0.3 * torch.randn(tensor.shape, generator=generator)).double()
-        for name, tensor in method.initial_parameters(stream(0, "initial")).items()
+        for name, tensor in method.initial_parameters(named_rng(0, "initial")).items()
     }
 
 
@@ -76,7 +76,7 @@ def doubled(transitions: Transitions) -> Transitions:
 def losses(method, demonstrations) -> Callable[..., Losses]:
     """Evaluate all losses at some parameters, always with the same draws."""
     contexts, explained = (
-        doubled(Transitions.of(part, method.standardise)) for part in (demonstrations[:2], demonstrations[2:7])
+        doubled(Transitions.of(part, method.normalise)) for part in (demonstrations[:2], demonstrations[2:7])
     )
 
     def evaluate(at: Parameters, negatives: Literal["same", "mismatched"] = "same") -> Losses:
@@ -131,18 +131,18 @@ def test_draws_have_the_mean_and_deviation_and_slopes_for_both() -> None:
 
 
 def test_the_last_state_of_each_trajectory_is_its_own_successor(method, demonstrations) -> None:
-    transitions = Transitions.of(demonstrations, method.standardise)
+    transitions = Transitions.of(demonstrations, method.normalise)
     expected = [
         observation
         for one in demonstrations
-        for observation in (*method.standardise(one.observations)[1:], method.standardise(one.observations)[-1])
+        for observation in (*method.normalise(one.observations)[1:], method.normalise(one.observations)[-1])
     ]
     assert np.array_equal(transitions.successors.numpy(), np.array(expected))
     assert transitions.lengths.tolist() == [len(one) for one in demonstrations]
 
 
 def test_thinned_transitions_are_different_ones_of_each_trajectory_in_order(method, demonstrations) -> None:
-    transitions = Transitions.of(demonstrations, method.standardise)
+    transitions = Transitions.of(demonstrations, method.normalise)
     generator = torch.Generator().manual_seed(0)
     thinned = transitions.thinned(4, generator)
     assert thinned.lengths.tolist() == [min(len(one), 4) for one in demonstrations]
@@ -156,17 +156,17 @@ def test_thinned_transitions_are_different_ones_of_each_trajectory_in_order(meth
 
 
 def test_q_is_the_mean_over_the_steps_of_each_trajectory(method, demonstrations, parameters, plain_mlp) -> None:
-    transitions = doubled(Transitions.of(demonstrations, method.standardise))
+    transitions = doubled(Transitions.of(demonstrations, method.normalise))
     inferred = infer(parameters, transitions)
     for index, one in enumerate(demonstrations):
-        pairs = np.concatenate([method.standardise(one.observations), one.actions], 1)
+        pairs = np.concatenate([method.normalise(one.observations), one.actions], 1)
         mean, raw = plain_mlp(network(parameters, "encoder"), torch.from_numpy(pairs).double()).mean(0).chunk(2)
         torch.testing.assert_close(inferred.mean[index], mean)
         torch.testing.assert_close(inferred.log_deviation[index], 5 * torch.tanh(raw / 5))
 
 
 def test_f_is_the_reward_shaped_by_the_potential(method, demonstrations, parameters, plain_mlp) -> None:
-    transitions = doubled(Transitions.of(demonstrations, method.standardise))
+    transitions = doubled(Transitions.of(demonstrations, method.normalise))
     contexts = torch.randn(len(transitions.states), 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     found = log_reward(parameters, transitions, contexts, 0.9)
     for step in range(len(contexts)):
@@ -178,7 +178,7 @@ def test_f_is_the_reward_shaped_by_the_potential(method, demonstrations, paramet
 
 
 def test_without_discounting_the_potential_telescopes(method, demonstrations, parameters, plain_mlp) -> None:
-    transitions = doubled(Transitions.of(demonstrations[:1], method.standardise))
+    transitions = doubled(Transitions.of(demonstrations[:1], method.normalise))
     contexts = torch.ones(7, 2, dtype=torch.float64)
     f, reward = log_reward(parameters, transitions, contexts, 1.0)
     ends = torch.cat([transitions.states[[0, -1]], contexts[:2]], -1)
@@ -289,7 +289,7 @@ def test_information_policy_and_negatives_look_at_the_policys_own_actions(
 ) -> None:
     leaves, generator = leaves_of(parameters), torch.Generator().manual_seed(11)
     contexts, explained = (
-        doubled(Transitions.of(part, method.standardise)) for part in (demonstrations[:2], demonstrations[2:7])
+        doubled(Transitions.of(part, method.normalise)) for part in (demonstrations[:2], demonstrations[2:7])
     )
     chosen = infer(leaves, contexts).draw(generator).detach()[[0, 1, 0, 1, 0]]
     of_steps = torch.arange(5).repeat_interleave(explained.lengths)
@@ -329,12 +329,12 @@ def test_likelihood_is_that_of_actions_given_the_context_of_another_trajectory(
     last[2:] = -1e4
     certain = {**parameters, "encoder.2.bias": last}
     contexts, explained = (
-        doubled(Transitions.of(part, method.standardise)) for part in (demonstrations[:2], demonstrations[2:7])
+        doubled(Transitions.of(part, method.normalise)) for part in (demonstrations[:2], demonstrations[2:7])
     )
     found = losses_of(certain, contexts, explained, 0.9, "same", torch.Generator().manual_seed(0))
     means, total, errors = infer(certain, contexts).mean, [], []
     for index, one in enumerate(demonstrations[2:7]):
-        steps = doubled(Transitions.of([one], method.standardise))
+        steps = doubled(Transitions.of([one], method.normalise))
         policy = action_distribution(certain, steps.states, means[index % 2].expand(len(one), 2))
         total.append(policy.log_density(steps.actions))
         errors.append((policy.mean - steps.actions).square().sum(-1))

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from dmil_core.configs import SIZES, TrainingConfig
-from dmil_core.demonstrations import Demonstration, DemonstrationError, Standardisation
+from dmil_core.demonstrations import Demonstration, DemonstrationError, Normalisation
 from dmil_core.methods.base import FineTuning, MetaLearner, Policy
 from dmil_core.methods.behaviour_cloning.method import BehaviourCloning, BehaviourCloningConfig
 from dmil_core.methods.pemirl.losses import Transitions, action_distribution, infer, losses_of
 from dmil_core.methods.pemirl.method import ContextBatch, Pemirl, PemirlConfig
 from dmil_core.networks import flatten, network
-from dmil_core.seeding import stream
-from tests.dmil_core.methods.toys import STEPS, meta_trained, practise, record, training_sets
+from dmil_core.seeding import named_rng
+from tests.dmil_core.methods.toys import STEPS, collect_rollouts, meta_trained, record, training_sets
 
 SMALL = PemirlConfig(
     hidden_layers=2, reward_layers=1, hidden_units=8, context_dim=2, trajectories=5, contexts=2, discount=0.9
@@ -30,7 +30,7 @@ def demonstrations(make_demonstrations) -> list[Demonstration]:
 
 @pytest.fixture
 def method(demonstrations) -> Pemirl:
-    return Pemirl(SMALL, action_dim=3, standardise=Standardisation.of(demonstrations))
+    return Pemirl(SMALL, action_dim=3, normalise=Normalisation.of(demonstrations))
 
 
 def test_defaults_are_those_of_table_12() -> None:
@@ -43,7 +43,7 @@ def test_defaults_are_those_of_table_12() -> None:
 
 
 def test_initial_parameters_have_the_sizes_of_the_settings(method) -> None:
-    shapes = {name: tuple(tensor.shape) for name, tensor in method.initial_parameters(stream(0, "initial")).items()}
+    shapes = {name: tuple(tensor.shape) for name, tensor in method.initial_parameters(named_rng(0, "initial")).items()}
     assert shapes == {
         "encoder.0.weight": (8, 7),
         "encoder.0.bias": (8,),
@@ -71,41 +71,42 @@ def test_initial_parameters_have_the_sizes_of_the_settings(method) -> None:
 
 @pytest.mark.parametrize("deviation", [0.01, 0.3, 10.0])
 def test_the_policys_deviation_begins_as_set(method, deviation: float) -> None:
-    method = Pemirl(SMALL.model_copy(update={"initial_deviation": deviation}), 3, method.standardise)
-    policy = action_distribution(method.initial_parameters(stream(0, "initial")), torch.zeros(5, 4), torch.zeros(5, 2))
+    method = Pemirl(SMALL.model_copy(update={"initial_deviation": deviation}), 3, method.normalise)
+    policy = action_distribution(
+        method.initial_parameters(named_rng(0, "initial")), torch.zeros(5, 4), torch.zeros(5, 2)
+    )
     torch.testing.assert_close(policy.log_deviation.exp(), torch.full((1, 3), deviation))
 
 
 def test_a_sample_has_different_demonstrations_where_there_are_enough(method, demonstrations) -> None:
-    material = method.sample(demonstrations, 0, stream(0, "batch"))
-    assert (len(material.contexts), len(material.explained)) == (2, 5)
-    assert len(set(material.ids)) == 7
-    again, other = (method.sample(demonstrations, 0, stream(seed, "batch")) for seed in (0, 1))
-    assert (material.ids, material.seed) == (again.ids, again.seed)
-    assert (material.ids, material.seed) != (other.ids, other.seed)
+    batch = method.sample(demonstrations, 0, named_rng(0, "batch"))
+    assert (len(batch.contexts), len(batch.explained)) == (2, 5)
+    assert len(set(batch.ids)) == 7
+    again, other = (method.sample(demonstrations, 0, named_rng(seed, "batch")) for seed in (0, 1))
+    assert (batch.ids, batch.seed) == (again.ids, again.seed)
+    assert (batch.ids, batch.seed) != (other.ids, other.seed)
 
 
 def test_a_sample_of_few_demonstrations_has_each_about_as_often(method, demonstrations) -> None:
-    ids = method.sample(demonstrations[:3], 0, stream(0, "batch")).ids
+    ids = method.sample(demonstrations[:3], 0, named_rng(0, "batch")).ids
     assert sorted(ids.count(one.id) for one in demonstrations[:3]) == [2, 2, 3]
     with pytest.raises(DemonstrationError, match="got none"):
-        method.sample([], 0, stream(0, "batch"))
+        method.sample([], 0, named_rng(0, "batch"))
 
 
 def test_task_gradient_is_that_of_the_weighted_sum(demonstrations) -> None:
     config = SMALL.model_copy(
         update={"information_weight": 0.3, "divergence_weight": 0.7, "policy_weight": 0.2, "steps_per_trajectory": 4}
     )
-    method = Pemirl(config, action_dim=3, standardise=Standardisation.of(demonstrations))
-    parameters = method.initial_parameters(stream(0, "initial"))
-    material = method.sample(demonstrations, 0, stream(0, "batch"))
-    found = method.task_gradient(parameters, material)
+    method = Pemirl(config, action_dim=3, normalise=Normalisation.of(demonstrations))
+    parameters = method.initial_parameters(named_rng(0, "initial"))
+    batch = method.sample(demonstrations, 0, named_rng(0, "batch"))
+    found = method.task_gradient(parameters, batch)
 
-    generator = torch.Generator().manual_seed(material.seed)
+    generator = torch.Generator().manual_seed(batch.seed)
     leaves = {name: tensor.clone().requires_grad_() for name, tensor in parameters.items()}
     contexts, explained = (
-        Transitions.of(drawn, method.standardise).thinned(4, generator)
-        for drawn in (material.contexts, material.explained)
+        Transitions.of(drawn, method.normalise).thinned(4, generator) for drawn in (batch.contexts, batch.explained)
     )
     parts = losses_of(leaves, contexts, explained, 0.9, "same", generator)
     total = parts.likelihood + 0.7 * parts.divergence + parts.discriminator + 0.2 * parts.policy
@@ -118,16 +119,16 @@ def test_task_gradient_is_that_of_the_weighted_sum(demonstrations) -> None:
 
 @pytest.mark.parametrize("negatives", ["same", "mismatched"])
 def test_task_gradient_is_pure(method, demonstrations, negatives: Literal["same", "mismatched"]) -> None:
-    method = Pemirl(SMALL.model_copy(update={"negatives": negatives, "steps_per_trajectory": 3}), 3, method.standardise)
-    parameters = method.initial_parameters(stream(0, "initial"))
+    method = Pemirl(SMALL.model_copy(update={"negatives": negatives, "steps_per_trajectory": 3}), 3, method.normalise)
+    parameters = method.initial_parameters(named_rng(0, "initial"))
     before, state = flatten(parameters), torch.get_rng_state()
-    material = method.sample(demonstrations, 0, stream(0, "batch"))
-    one, two = (method.task_gradient(parameters, material) for _ in range(2))
+    batch = method.sample(demonstrations, 0, named_rng(0, "batch"))
+    one, two = (method.task_gradient(parameters, batch) for _ in range(2))
     assert torch.equal(one.gradient, two.gradient)
     assert one.metrics == two.metrics
     assert torch.equal(flatten(parameters), before)
     assert torch.equal(torch.get_rng_state(), state)
-    renamed = ContextBatch(material.contexts, material.explained, material.seed + 1)
+    renamed = ContextBatch(batch.contexts, batch.explained, batch.seed + 1)
     assert not torch.equal(method.task_gradient(parameters, renamed).gradient, one.gradient)
 
 
@@ -141,8 +142,8 @@ def test_single_steps_and_ragged_trajectories_can_be_learned_from(
     config = SMALL.model_copy(update={"negatives": negatives, "steps_per_trajectory": steps})
     method = Pemirl.prepared(config, 3, demonstrations)
     assert isinstance(method, MetaLearner)
-    parameters = method.initial_parameters(stream(0, "initial"))
-    found = method.task_gradient(parameters, method.sample(demonstrations, 0, stream(0, "batch")))
+    parameters = method.initial_parameters(named_rng(0, "initial"))
+    found = method.task_gradient(parameters, method.sample(demonstrations, 0, named_rng(0, "batch")))
     assert found.gradient.shape == flatten(parameters).shape
     assert torch.isfinite(found.gradient).all()
     assert found.gradient.any()
@@ -154,21 +155,21 @@ def test_single_steps_and_ragged_trajectories_can_be_learned_from(
 def test_a_batch_of_one_step_can_be_learned_from(make_demonstrations) -> None:
     demonstrations = make_demonstrations(0, [1])
     method = Pemirl.prepared(SMALL.model_copy(update={"trajectories": 1, "contexts": 1}), 3, demonstrations)
-    parameters = method.initial_parameters(stream(0, "initial"))
-    found = method.task_gradient(parameters, method.sample(demonstrations, 0, stream(0, "batch")))
+    parameters = method.initial_parameters(named_rng(0, "initial"))
+    found = method.task_gradient(parameters, method.sample(demonstrations, 0, named_rng(0, "batch")))
     assert torch.isfinite(found.gradient).all()
     assert found.gradient.any()
 
 
 def test_the_policy_acts_by_the_mean_of_the_shots_contexts(method, demonstrations, plain_mlp) -> None:
-    parameters = method.initial_parameters(stream(1, "initial"))
+    parameters = method.initial_parameters(named_rng(1, "initial"))
     policy = method.adapt(parameters, demonstrations[:3], NO_TUNING)
-    means = [infer(parameters, Transitions.of([one], method.standardise)).mean[0] for one in demonstrations[:3]]
+    means = [infer(parameters, Transitions.of([one], method.normalise)).mean[0] for one in demonstrations[:3]]
     context = torch.stack(means).mean(0)
     observations = demonstrations[4].observations
     memory = policy.start(len(observations))
     decision = policy.act(observations, memory)
-    states = torch.from_numpy(method.standardise(observations))
+    states = torch.from_numpy(method.normalise(observations))
     for state, action in zip(states, decision.actions, strict=True):
         expected = plain_mlp(network(parameters, "policy"), torch.cat([state, context]))
         np.testing.assert_allclose(action, expected, rtol=1e-4, atol=1e-6)
@@ -180,7 +181,7 @@ def test_the_policy_acts_by_the_mean_of_the_shots_contexts(method, demonstration
 
 
 def test_adaptation_is_pure_and_takes_no_gradient_step(method, demonstrations) -> None:
-    parameters = method.initial_parameters(stream(0, "initial"))
+    parameters = method.initial_parameters(named_rng(0, "initial"))
     before, state, observations = flatten(parameters), torch.get_rng_state(), demonstrations[5].observations
     one, two = (
         method.adapt(parameters, demonstrations[:2], FineTuning(steps, 0.5)).act(
@@ -227,7 +228,7 @@ def test_new_tasks_are_told_from_one_or_two_demonstrations() -> None:
         BehaviourCloningConfig(hidden_layers=2, hidden_units=32, output_scale=0.1, trajectories=4, window=16), 2, every
     )
     cloned = meta_trained(cloning, sets, training)
-    without = WithoutContext(config, 2, method.standardise)
+    without = WithoutContext(config, 2, method.normalise)
 
     errors, successes = [], []
     for task in range(100, 108):
@@ -239,7 +240,7 @@ def test_new_tasks_are_told_from_one_or_two_demonstrations() -> None:
             cloning.adapt(cloned, demonstrations[:2], NO_TUNING),
         ]
         errors.append([action_error(policy, demonstrations[2:]) for policy in policies])
-        successes += [rollout.success for rollout in practise(policies[1], f"task-{task}", 0, 6 * STEPS)]
+        successes += [rollout.success for rollout in collect_rollouts(policies[1], f"task-{task}", 0, 6 * STEPS)]
     one_shot, two_shot, no_context, behaviour_cloning = np.mean(errors, 0)
     assert max(one_shot, two_shot) < 0.5 * min(no_context, behaviour_cloning)
     assert np.mean(successes) > 0.5
