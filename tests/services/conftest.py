@@ -1,5 +1,6 @@
 """What the tests of the service share: one small store of demonstrations, one Ray cluster, and the programs."""
 
+import functools
 import os
 import shutil
 import signal
@@ -28,6 +29,7 @@ from services.storage.checkpoints import Checkpoint, Checkpoints
 
 PROJECT = Path(__file__).parents[2]
 CHROMIUM = shutil.which("chromium")
+QUICK_EVALUATION = ("--evaluation.shots", "1", "--evaluation.episodes", "1", "--evaluation.fine-tuning-steps", "1")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -179,6 +181,35 @@ def workplace(tmp_path: Path, store: DemoStore, mlflow_file: str, monkeypatch: p
     return tmp_path
 
 
+@pytest.fixture(scope="session")
+def shared_run(store: DemoStore, mlflow_file: str, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Meta-trains in this process, once a session for all tests that only read what comes of it; returns its folder."""
+    runs = tmp_path_factory.mktemp("runs")
+
+    @functools.cache
+    def run(name: str, *arguments: str) -> Path:
+        with pytest.MonkeyPatch.context() as environment:
+            environment.setenv("DMIL_DATA", str(store.root))
+            environment.setenv("MLFLOW_TRACKING_URI", mlflow_file)
+            environment.chdir(runs)
+            where = ["--runner", "local", "--runs", str(runs), "--name", name]
+            meta_train.run(["--preset", "ml10-smoke", *where, *arguments])
+        return runs / name
+
+    return run
+
+
+@pytest.fixture
+def copied_run(workplace: Path, shared_run: Callable[..., Path]) -> Callable[[int], Path]:
+    """Returns runs/run, a copy of a shared run of so many iterations, for a test to damage."""
+
+    def copy(iterations: int) -> Path:
+        source = shared_run(f"after-{iterations}", "--training.iterations", str(iterations), *QUICK_EVALUATION)
+        return Path(shutil.copytree(source, workplace / "runs" / "run"))
+
+    return copy
+
+
 class Server:
     """A real MLflow server on loopback that can go away and come back with its database."""
 
@@ -262,9 +293,6 @@ def programs(workplace: Path) -> Iterator[Programs]:
     yield programs
     programs.kill()
     signal.signal(signal.SIGINT, before)
-
-
-QUICK_EVALUATION = ("--evaluation.shots", "1", "--evaluation.episodes", "1", "--evaluation.fine-tuning-steps", "1")
 
 
 @pytest.fixture

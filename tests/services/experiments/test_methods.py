@@ -30,9 +30,8 @@ from services import meta_train
 from services.demonstrations.store import DemoStore
 from services.distributed.ray_meta_training import RayMetaTraining
 from services.distributed.simulation_worker import SimulationWorker
-from services.evaluation.results import EpisodeResult, read_rows
 from services.experiments.experiment import Experiment, open_runner
-from services.storage.checkpoints import Checkpoint, Checkpoints
+from services.storage.checkpoints import Checkpoints
 from tests.services.conftest import QUICK_EVALUATION
 from tests.services.distributed.courses import alone, assert_same_bits, follow, pid_of, plan_of
 
@@ -84,30 +83,6 @@ def test_a_killed_run_that_practises_goes_on_to_the_same_bits(programs, wait_for
     states = [Checkpoints(workplace / "runs" / name / "checkpoints", 1).newest() for name in ("killed", "whole")]
     assert states[0].digest == states[1].digest
     assert states[0].manifest.environment_steps == states[1].manifest.environment_steps
-
-
-@pytest.mark.parametrize("method", OURS)
-def test_a_run_comes_to_its_table_and_goes_on_to_the_same_bits(workplace: Path, method: str):
-    def train(name: str, *arguments: str) -> Checkpoint:
-        meta_train.run(["--runner", "local", *QUICK_EVALUATION, *arguments])
-        return Checkpoints(workplace / "runs" / name / "checkpoints", kept=1).newest()
-
-    begin = ("--method", method, "--preset", "smoke", "--name")
-    whole = train("whole", *begin, "whole")
-    rows = read_rows(workplace / "runs/whole/episodes.jsonl", EpisodeResult)
-    assert {row.method for row in rows} == {method}
-    assert len({row.task for row in rows}) == 4
-    summary = json.loads((workplace / "runs/whole/summary.json").read_text())
-    assert summary["method"] == method
-    assert bool(summary["environment_steps"]) == (method in PRACTISING)
-    if method not in LEARNERS:
-        assert whole.manifest.iteration == 0
-        return
-    train("parts", *begin, "parts", "--training.iterations", "7")
-    parts = train("parts", "--resume", "parts", "--training.iterations", str(whole.manifest.iteration))
-    assert parts.manifest.environment_steps == whole.manifest.environment_steps
-    for one, other in zip(parts.state, whole.state, strict=True):
-        assert np.array_equal(one, other)
 
 
 @pytest.mark.parametrize("method", LEARNERS)

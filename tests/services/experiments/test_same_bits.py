@@ -1,28 +1,69 @@
 """Runs come to the digests that were written down, on the kind of processor that they were written down for."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from dmil_core.methods.base import FineTuning
-from dmil_core.methods.registry import method_type
-from services.storage.checkpoints import Checkpoint
-from tests.services.experiments.same_bits import RUNS, processor, train
+from dmil_core.methods.base import FineTuning, MetaLearner, PractisingLearner
+from dmil_core.methods.registry import OURS, method_type
+from services import meta_train
+from services.demonstrations.store import DemoStore
+from services.evaluation.results import EpisodeResult, read_rows
+from services.storage.checkpoints import Checkpoint, Checkpoints
+from tests.services.conftest import QUICK_EVALUATION
+from tests.services.experiments.same_bits import METHODS, RUNS, processor, train
 
 KNOWN = json.loads(Path(__file__).with_name("same_bits.json").read_text())
 OLD = Path(__file__).with_name("old_checkpoints")
 
 
+@pytest.fixture(scope="module")
+def runs(store: DemoStore, mlflow_file: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The folder of all runs here: each is trained once."""
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("DMIL_DATA", str(store.root))
+        environment.setenv("MLFLOW_TRACKING_URI", mlflow_file)
+        environment.chdir(runs := tmp_path_factory.mktemp("runs"))
+        yield runs
+
+
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.thorough) if name.endswith("-1") else name for name in RUNS]
 )
-def test_a_run_comes_to_the_same_bits_as_ever(workplace: Path, name: str):
+def test_a_run_comes_to_the_same_bits_as_ever(runs: Path, name: str):
+    digests = train(name, runs)
     if processor() not in KNOWN:
         pytest.skip(f"no digests for {processor()}; write them down by python -m tests.services.experiments.same_bits")
-    assert train(name, workplace / "runs") == KNOWN[processor()][name]
+    assert digests == KNOWN[processor()][name]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_run_comes_to_its_table_and_goes_on_to_the_same_bits(runs: Path, workplace: Path, method: str):
+    folder = runs / f"{method}-0"
+    if not folder.exists():
+        train(folder.name, runs)
+    rows = read_rows(folder / "episodes.jsonl", EpisodeResult)
+    assert {row.method for row in rows} == {method}
+    assert len({row.task for row in rows}) == 4
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["method"] == method
+    whole = Checkpoints(folder / "checkpoints", kept=1).newest()
+    kind = OURS[method]
+    assert bool(summary["environment_steps"]) == issubclass(kind, PractisingLearner)
+    if not issubclass(kind, MetaLearner):
+        assert whole.manifest.iteration == 0
+        return
+    begin = ("--method", method, "--preset", "ml10-smoke", "--name", "parts", "--training.iterations", "7")
+    for arguments in (begin, ("--resume", "parts", "--training.iterations", str(whole.manifest.iteration))):
+        meta_train.run([*arguments, "--runner", "local", *QUICK_EVALUATION])
+    parts = Checkpoints(workplace / "runs" / "parts" / "checkpoints", kept=1).newest()
+    assert parts.manifest.environment_steps == whole.manifest.environment_steps
+    for one, other in zip(parts.state, whole.state, strict=True):
+        assert np.array_equal(one, other)
 
 
 @pytest.mark.parametrize("method", sorted(path.name for path in OLD.iterdir()))

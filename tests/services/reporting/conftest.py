@@ -10,7 +10,6 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page
 
 from dmil_core.configs import preset_of
-from services import meta_train
 from services.cli.composition import checked
 from services.cli.yaml_files import merged
 from services.demonstrations.store import DemoStore, data_root
@@ -129,14 +128,9 @@ def trained(planar_visits: Path) -> Callable[..., FinishedRun]:
 
 
 @pytest.fixture(scope="session")
-def finished(store: DemoStore, mlflow_file: str, tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
+def finished(shared_run: Callable[..., Path]) -> FinishedRun:
     """A run of four iterations on three tasks, evaluated on the way too: two episodes for each of 1 and 2 shots."""
-    runs = tmp_path_factory.mktemp("runs")
-    with pytest.MonkeyPatch.context() as environment:
-        environment.setenv("DMIL_DATA", str(store.root))
-        environment.setenv("MLFLOW_TRACKING_URI", mlflow_file)
-        arguments = ["--preset", "ml10-smoke", "--runner", "local", "--runs", str(runs), "--name", "tiny"]
-        arguments += ["--training.iterations", "4", "--training.checkpoint-every", "2", "--evaluation.every", "2"]
-        arguments += ["--evaluation.shots", "1", "2", "--evaluation.fine-tuning-steps", "1"]
-        meta_train.run(arguments)
-    return FinishedRun(runs / "tiny")
+    schedule = ("--training.iterations", "4", "--training.checkpoint-every", "2", "--evaluation.every", "2")
+    return FinishedRun(
+        shared_run("tiny", *schedule, "--evaluation.shots", "1", "2", "--evaluation.fine-tuning-steps", "1")
+    )

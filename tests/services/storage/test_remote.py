@@ -21,6 +21,7 @@ from services.experiments.experiment import Experiment, open_runner
 from services.storage.checkpoints import FILES, SEAL, Checkpoint, CheckpointError, Checkpoints
 from services.storage.remote import STORAGE, Storage
 from services.storage.replication import Replica, replicated
+from tests.services.conftest import QUICK_EVALUATION
 
 S3 = {"AWS_ACCESS_KEY_ID": "any", "AWS_SECRET_ACCESS_KEY": "any", "AWS_DEFAULT_REGION": "us-east-1"}
 
@@ -122,11 +123,14 @@ Replica(Path(sys.argv[1]), Dying(sys.argv[2])).copy()
 
 
 @pytest.mark.parametrize("parts", [0, 1, 4, 5, 7, 9])
-def test_killed_between_parts_it_leaves_whole_checkpoints_only(url: str, train, workplace: Path, parts: int):
+def test_killed_between_parts_it_leaves_whole_checkpoints_only(
+    url: str, shared_run, workplace: Path, monkeypatch, parts: int
+):
     """Two checkpoints of five parts each: whoever resumes gets the newest that is whole, and the next copy is whole."""
-    del os.environ[STORAGE]
-    train("run", "--training.iterations", "4", "--training.checkpoint-every", "2")
-    folder, storage = workplace / "runs" / "run", Storage(url)
+    monkeypatch.delenv(STORAGE)
+    twice = ("--training.iterations", "4", "--training.checkpoint-every", "2", *QUICK_EVALUATION)
+    folder = Path(shutil.copytree(shared_run("saved-twice", *twice), workplace / "runs" / "run"))
+    storage = Storage(url)
     first, second = sorted(path.name for path in (folder / "checkpoints").iterdir())
     killed = subprocess.run([sys.executable, "-c", KILLED, str(folder), url, str(parts)])
     assert killed.returncode == -signal.SIGKILL
