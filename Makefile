@@ -4,7 +4,7 @@ BIN := .venv/bin
 INSTALLED := .venv/installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train cluster cluster-stop test test-all missing tools check-deploy audit clean
+.PHONY: help setup train cluster cluster-stop test test-all missing tools mutants check-deploy audit clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):[^#]*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -66,6 +66,9 @@ tools:
 	@test -z "$(MISSING)" || \
 		{ echo "test-all: found no $(MISSING): apt-get install --no-install-recommends $(MISSING)"; exit 1; }
 	@$(NEEDS_KUBECTL)
+
+mutants: setup ## put 40 faults into copies of the tree, one by one, and print which test of `make test` notices each
+	@$(BIN)/python -m tests.mutants
 
 check-deploy: setup ## of test-all, what holds deploy/ against schemas, checkers and the project; no container engine
 	@command -v promtool >/dev/null || { echo "check-deploy: found no promtool: apt-get install prometheus"; exit 1; }

@@ -59,7 +59,7 @@ SMALL_MLSH = MlshConfig(
 
 @pytest.fixture
 def demonstrations(make_demonstrations) -> list[Demonstration]:
-    return make_demonstrations(0, [7, 3, 9, 1, 6])
+    return make_demonstrations(0, [7, 3, 9, 1, 6, 5, 8, 4, 2])
 
 
 @pytest.fixture

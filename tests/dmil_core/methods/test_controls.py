@@ -22,11 +22,6 @@ SMALL: dict[str, Any] = {"hidden_layers": 2, "hidden_units": 16}
 
 
 @pytest.fixture
-def demonstrations(make_demonstrations) -> list[Demonstration]:
-    return make_demonstrations(0, [7, 3, 9, 4, 6, 5, 8, 4, 5])
-
-
-@pytest.fixture
 def cloning(demonstrations) -> BehaviourCloning:
     return BehaviourCloning.prepared(BehaviourCloningConfig(**SMALL, trajectories=2, window=4), 3, demonstrations)
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dmil_core.configs import TrainingConfig
-from dmil_core.demonstrations import Demonstration, Normalisation
+from dmil_core.demonstrations import Normalisation
 from dmil_core.losses import Steps
 from dmil_core.methods.base import FineTuning
 from dmil_core.methods.dmil import meta_gradient
@@ -19,11 +19,6 @@ from dmil_core.seeding import named_rng
 from tests.dmil_core.methods.toys import meta_trained, record, recovered, training_sets
 
 SMALL = DmilConfig(sub_skills=3, hidden_layers=2, hidden_units=8, trajectories=2, window=4, inner_learning_rate=0.05)
-
-
-@pytest.fixture
-def demonstrations(make_demonstrations) -> list[Demonstration]:
-    return make_demonstrations(0, [7, 3, 9, 4, 6, 5, 8, 4, 5])
 
 
 @pytest.fixture

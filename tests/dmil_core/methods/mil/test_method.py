@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dmil_core.configs import TrainingConfig
-from dmil_core.demonstrations import Demonstration, DemonstrationError, Normalisation
+from dmil_core.demonstrations import DemonstrationError, Normalisation
 from dmil_core.methods.base import FineTuning, MetaLearner
 from dmil_core.methods.mil.losses import Support, inner_loss
 from dmil_core.methods.mil.method import Mil, MilBatch, MilConfig
@@ -20,11 +20,6 @@ from tests.dmil_core.methods.toys import collect_rollouts, meta_trained, record,
 
 Order = Literal["first", "second"]
 ORDERS = pytest.mark.parametrize("order", ["first", "second"])
-
-
-@pytest.fixture
-def demonstrations(make_demonstrations) -> list[Demonstration]:
-    return make_demonstrations(0, [7, 3, 9, 4, 1, 5])
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dmil_core.configs import ExperimentConfig, TrainingConfig
-from dmil_core.demonstrations import Demonstration, DemonstrationError
+from dmil_core.demonstrations import DemonstrationError
 from dmil_core.losses import Steps
 from dmil_core.methods.base import FineTuning, MetaLearner
 from dmil_core.methods.mlsh import method as mlsh
@@ -20,11 +20,6 @@ from dmil_core.networks import flatten, mlp, unflatten
 from dmil_core.seeding import named_rng
 from tests.dmil_core.methods.conftest import SMALL_MLSH
 from tests.dmil_core.methods.toys import act_along, meta_trained, record, recovered, training_sets
-
-
-@pytest.fixture
-def demonstrations(make_demonstrations) -> list[Demonstration]:
-    return make_demonstrations(0, [7, 3, 9, 1, 6, 5, 8, 4, 2])
 
 
 @pytest.fixture

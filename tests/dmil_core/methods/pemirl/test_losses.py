@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dmil_core.demonstrations import Demonstration, Normalisation
+from dmil_core.demonstrations import Normalisation
 from dmil_core.methods.pemirl.losses import (
     Gaussian,
     Losses,
@@ -45,11 +45,6 @@ TRAINED = {
     "discriminator": {"reward", "potential"},
     "policy": {"policy", "log_deviation"},
 }
-
-
-@pytest.fixture
-def demonstrations(make_demonstrations) -> list[Demonstration]:
-    return make_demonstrations(0, [7, 3, 9, 1, 6, 5, 8, 4, 5])
 
 
 @pytest.fixture

@@ -24,11 +24,6 @@ NO_TUNING = FineTuning(steps=0, learning_rate=0.1)
 
 
 @pytest.fixture
-def demonstrations(make_demonstrations) -> list[Demonstration]:
-    return make_demonstrations(0, [7, 3, 9, 1, 6, 5, 8, 4, 5])
-
-
-@pytest.fixture
 def method(demonstrations) -> Pemirl:
     return Pemirl(SMALL, action_dim=3, normalise=Normalisation.of(demonstrations))
 
