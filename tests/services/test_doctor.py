@@ -73,6 +73,7 @@ def test_a_machine_is_examined_and_left_as_it_was(programs, workplace: Path, mon
     assert "secret" not in printed
 
 
+@pytest.mark.thorough
 def test_a_cluster_is_examined_by_node(programs, workplace: Path, joined):
     code, printed = programs("doctor")
     assert "shared storage" not in printed  # one node shares with nobody

@@ -187,7 +187,7 @@ def descendants(session: str) -> list[psutil.Process]:
     ("runner", "number", "wanted"),
     [
         ("local", signal.SIGINT, 130),
-        ("local", signal.SIGTERM, 143),
+        pytest.param("local", signal.SIGTERM, 143, marks=pytest.mark.thorough),
         pytest.param("ray", signal.SIGINT, 130, marks=[pytest.mark.thorough, pytest.mark.alone]),
         pytest.param("ray", signal.SIGTERM, 143, marks=pytest.mark.alone),
     ],

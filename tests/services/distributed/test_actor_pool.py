@@ -17,8 +17,6 @@ from services.distributed.calls import Worker
 from services.distributed.errors import DeadlyCallError, LostError
 from services.distributed.metrics import Meter, WorkerCounter
 
-pytestmark = pytest.mark.alone  # some are to be overtaken for their slowness, the others not
-
 
 @pytest.fixture
 def make(joined) -> Iterator:
@@ -153,6 +151,7 @@ def test_calls_that_wait_behind_a_deadly_one_are_not_suspected(make, counter: Wo
     pool.close()
 
 
+@pytest.mark.alone
 def test_a_hung_actor_is_overtaken(make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture):
     """Both where others wait for what it makes, and where it is the only one."""
     monkeypatch.setattr("services.distributed.stragglers.MIN_TIMEOUT_SECONDS", 0.5)
@@ -174,6 +173,7 @@ def test_a_hung_actor_is_overtaken(make, monkeypatch: pytest.MonkeyPatch, caplog
         pool.close()
 
 
+@pytest.mark.alone
 def test_where_the_slow_actor_is_first_its_answer_counts(
     make, counter: WorkerCounter, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -85,6 +85,7 @@ def port(joined, workplace: Path, wait_for) -> Iterator[int]:
     program.communicate()
 
 
+@pytest.mark.thorough
 def test_a_run_with_a_killed_worker_arrives(port: int, workplace: Path, wait_for):
     found: Series = {}
 

@@ -26,22 +26,22 @@ def cut(groups: int, size: int) -> list[slice]:
 
 
 @pytest.mark.usefixtures("joined")
-@pytest.mark.parametrize(("slots", "group"), [pytest.param(5, 1, marks=pytest.mark.thorough), (7, 3)])
-def test_any_number_of_workers_ends_with_the_same_bits(config, store: DemoStore, data, slots: int, group: int):
+@pytest.mark.parametrize(("slots", "group"), [(5, 1), (7, 3)])
+@pytest.mark.parametrize(
+    ("workers", "fan_in"),
+    [(3, 2), *(pytest.param(*case, marks=pytest.mark.thorough) for case in ((1, 8), (2, 2), (3, 4)))],
+)
+def test_any_number_of_workers_ends_with_the_same_bits(
+    config, store: DemoStore, data, slots: int, group: int, workers: int, fan_in: int
+):
     experiment = Experiment(training(config, slots, group), store)
     wanted = alone(experiment, data)
     assert np.isfinite(wanted.states[-1].parameters).all()
     assert wanted.numbers == [state.iteration for state in wanted.states] == list(range(1, ITERATIONS + 1))
     assert len(wanted.slots[0]) == slots
     plan = plan_of(experiment, data)
-    with open_runner("ray", experiment.suite, 3) as runner:
-        whole = runner.meta_train(plan)
-        assert_same_bits(follow(whole), wanted)
-        whole.close()
-        for workers, fan_in in ((1, 8), (2, 2), (3, 4), (3, 2)):
-            meta_training = RayMetaTraining(plan, workers, fan_in)
-            assert_same_bits(follow(meta_training), wanted)
-            meta_training.close()
+    with open_runner("ray", experiment.suite, workers):
+        assert_same_bits(follow(RayMetaTraining(plan, workers, fan_in)), wanted)
 
 
 @pytest.mark.thorough
@@ -140,7 +140,7 @@ def test_a_killed_worker_changes_nothing(
 
 
 @pytest.mark.usefixtures("joined")
-@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.thorough), 3])
 def test_the_learner_receives_one_gradient(
     config, store: DemoStore, data, workers: int, monkeypatch: pytest.MonkeyPatch
 ):

@@ -31,6 +31,14 @@ def runs(store: DemoStore, mlflow_file: str, tmp_path_factory: pytest.TempPathFa
         yield runs
 
 
+def finished(runs: Path, method: str) -> Checkpoint:
+    """Return the last checkpoint of a method's run, which is trained if no other test has done so."""
+    folder = runs / f"{method}-0"
+    if not folder.exists():
+        train(folder.name, runs)
+    return Checkpoints(folder / "checkpoints", kept=1).newest()
+
+
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.thorough) if name.endswith("-1") else name for name in RUNS]
 )
@@ -42,21 +50,29 @@ def test_a_run_comes_to_the_same_bits_as_ever(runs: Path, name: str):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_run_comes_to_its_table_and_goes_on_to_the_same_bits(runs: Path, workplace: Path, method: str):
-    folder = runs / f"{method}-0"
-    if not folder.exists():
-        train(folder.name, runs)
+def test_a_run_of_each_method_comes_to_its_table(runs: Path, method: str):
+    whole, folder = finished(runs, method), runs / f"{method}-0"
     rows = read_rows(folder / "episodes.jsonl", EpisodeResult)
     assert {row.method for row in rows} == {method}
     assert len({row.task for row in rows}) == 4
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["method"] == method
-    whole = Checkpoints(folder / "checkpoints", kept=1).newest()
     kind = OURS[method]
     assert bool(summary["environment_steps"]) == issubclass(kind, PractisingLearner)
     if not issubclass(kind, MetaLearner):
         assert whole.manifest.iteration == 0
-        return
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        method if method in ("option-gail", "mlsh") else pytest.param(method, marks=pytest.mark.thorough)
+        for method, kind in OURS.items()
+        if issubclass(kind, MetaLearner)
+    ],
+)
+def test_a_run_that_is_resumed_comes_to_the_same_bits(runs: Path, workplace: Path, method: str):
+    whole = finished(runs, method)
     begin = ("--method", method, "--preset", "ml10-smoke", "--name", "parts", "--training.iterations", "7")
     for arguments in (begin, ("--resume", "parts", "--training.iterations", str(whole.manifest.iteration))):
         meta_train.run([*arguments, "--runner", "local", *QUICK_EVALUATION])

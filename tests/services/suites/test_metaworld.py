@@ -1,5 +1,6 @@
 """Meta-World's episodes follow from their seeds, its goals are shown or hidden, its splits are the published ones."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,12 @@ REFERENCE = (
     ["door-close", "drawer-open", "lever-pull", "shelf-place", "sweep"],
 )  # fmt: skip
 ALL_TASKS = sorted({*OFFICIAL[0], *OFFICIAL[1], *REFERENCE[0], *REFERENCE[1]})
+SMOKE_TASKS = ("door-close", "drawer-close", "push", "reach")
+
+
+def each_of(tasks: Iterable[str]) -> list[Any]:
+    """Return tasks as cases, of which `make test` takes those of the preset smoke."""
+    return [task if task in SMOKE_TASKS else pytest.param(task, marks=pytest.mark.thorough) for task in tasks]
 
 
 # The five of the paper's Table 5 to 8 and of the authors' code; their meta-training tasks are Meta-World's other 45.
@@ -200,7 +207,7 @@ def test_a_hidden_goal_is_zero_and_the_rest_is_equal(task):
         assert hidden_info["success"] == info["success"]
 
 
-@pytest.mark.parametrize("task", [task for task in TASKS if task != "push-around-wall"])
+@pytest.mark.parametrize("task", each_of(task for task in TASKS if task != "push-around-wall"))
 def test_hidden_goals_are_hidden_as_meta_world_hides_them(task):
     stock: Any = ALL_V3_ENVIRONMENTS_GOAL_HIDDEN[f"{task}-v3-goal-hidden"]()
     stock._freeze_rand_vec, stock.seeded_rand_vec = False, True
@@ -225,7 +232,7 @@ def test_the_expert_sees_the_hidden_goal_and_its_demonstration_does_not():
     assert not kept.observations[:, -3:].any()
 
 
-@pytest.mark.parametrize("task", ALL_TASKS)
+@pytest.mark.parametrize("task", each_of(ALL_TASKS))
 def test_an_episode_follows_from_its_seed_alone(task: str):
     suite = MetaWorldSuite(SuiteConfig())
     used, fresh = suite.make_env(task), suite.make_env(task)
@@ -249,7 +256,7 @@ def test_an_episode_follows_from_its_seed_alone(task: str):
     assert not np.array_equal(first[0], other[0])
 
 
-@pytest.mark.parametrize("task", ALL_TASKS)
+@pytest.mark.parametrize("task", each_of(ALL_TASKS))
 def test_the_goal_is_visible(task: str):
     env = MetaWorldSuite(SuiteConfig()).make_env(task)
     observation, _ = env.reset(seed=3)

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from dmil_core.configs import SuiteConfig
 from services.suites.metaworld import MetaWorldSuite, SeededEpisodes
 from services.suites.metaworld_speed import fast_environment, quaternion
+from tests.services.suites.test_metaworld import each_of
 
 ALL_TASKS = sorted(name.removesuffix("-v3") for name in ENV_POLICY_MAP)
-SMOKE_TASKS = {"reach", "push", "drawer-close", "door-close"}
 EXPERT_STEPS, TRAILING_STEPS, RANDOM_STEPS = 200, 10, 60
 
 
@@ -62,9 +62,7 @@ def compare(task: str, envs: list[Env], seed: int, *, with_expert: bool) -> bool
     return solved_at is not None
 
 
-@pytest.mark.parametrize(
-    "task", [task if task in SMOKE_TASKS else pytest.param(task, marks=pytest.mark.thorough) for task in ALL_TASKS]
-)
+@pytest.mark.parametrize("task", each_of(ALL_TASKS))
 def test_episodes_are_those_of_meta_world_to_the_bit(task: str):
     """Observations, successes and, where asked for, rewards and all else that a step's info holds."""
     suite = MetaWorldSuite(SuiteConfig())
@@ -77,7 +75,7 @@ def test_episodes_are_those_of_meta_world_to_the_bit(task: str):
     compare(task, [*envs, suite.make_env(task)], 1, with_expert=False)
 
 
-@pytest.mark.parametrize("task", ALL_TASKS)
+@pytest.mark.parametrize("task", each_of(ALL_TASKS))
 def test_success_is_judged_alike_wherever_the_object_is(task: str):
     """Episodes cross the border of success at few places; here it is asked for many observations around the goal."""
     stock, fast = stock_env(task), MetaWorldSuite(SuiteConfig()).make_env(task)

@@ -37,6 +37,7 @@ def steps_of(uri: str, run: Run, metric: str) -> list[int]:
     return sorted(point.step for point in MlflowClient(uri).get_metric_history(run.info.run_id, metric))
 
 
+@pytest.mark.thorough
 def test_a_killed_sweep_goes_on_where_it_was(
     programs, workplace: Path, mlflow_file: str, runs_of, wait_for, data: dict[str, TaskDemonstrations]
 ) -> None:

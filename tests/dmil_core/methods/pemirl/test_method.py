@@ -204,6 +204,7 @@ def action_error(policy: Policy, demonstrations: list[Demonstration]) -> float:
     return float(np.mean(errors))
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("unchecked")
 def test_new_tasks_are_told_from_one_or_two_demonstrations() -> None:
     sets = training_sets(16)
