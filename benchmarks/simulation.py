@@ -39,6 +39,7 @@ from dmil_core.seeding import named_rng
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.distributed.simulation_worker import SimulationWorker
+from services.distributed.work_items import AdaptationRollouts
 from services.rollouts.adaptations import AdaptationOutcome, plan_adaptations
 from services.rollouts.episodes import demonstrate
 from services.suites.metaworld import SPLITS, MetaWorldSuite, SeededEpisodes
@@ -291,9 +292,9 @@ def start_worker(suite: MetaWorldSuite) -> None:
     worker = SimulationWorker(suite)
 
 
-def try_out(call: tuple[Any, ...]) -> AdaptationOutcome:
-    """Let this process's simulation worker adapt once and roll out."""
-    return worker.try_out(*call)
+def run_item(item: AdaptationRollouts) -> AdaptationOutcome:
+    """Run a work item on this process's simulation worker."""
+    return worker.run(item)
 
 
 def evaluation_row(given: Arguments) -> dict[str, Any]:
@@ -306,7 +307,12 @@ def evaluation_row(given: Arguments) -> dict[str, Any]:
     settings = EvaluationConfig(shots=(1,), episodes=episodes, support_draws=DRAWS, fine_tuning_steps=0)
     plan = plan_adaptations([("meta-testing", task) for task in tasks], settings)
     shapes = {name: tensor.shape for name, tensor in parameters.items()}
-    flat = flatten(parameters).numpy()
+    flat = partial(np.array, flatten(parameters).numpy())
+    held_out = {task: partial(list, found) for task, found in demonstrations.items()}
+    items = [
+        AdaptationRollouts(method, shapes, flat, adaptation, held_out[adaptation.task], settings, 0)
+        for adaptation in plan
+    ]
     agents: list[StockAgent] = []
     outcomes: list[AdaptationOutcome] = []
     envs: Any = gymnasium.make_vec(
@@ -325,10 +331,7 @@ def evaluation_row(given: Arguments) -> dict[str, Any]:
     with ProcessPoolExecutor(cores, get_context("spawn"), start_worker, (suite,)) as pool:
 
         def ours() -> None:
-            calls = [
-                (method, flat, shapes, adaptation, demonstrations[adaptation.task], settings, 0) for adaptation in plan
-            ]
-            outcomes[:] = pool.map(try_out, calls)
+            outcomes[:] = pool.map(run_item, items)
 
         both = {"stock": stock, "ours": ours}
         alternate(both, 1)  # builds the environments

@@ -1,4 +1,4 @@
-"""Do the piece of work again in which a program failed: alone, in this process, with the whole traceback."""
+"""Run the work item again in which a program failed: alone, in this process, with the whole traceback."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -17,6 +17,7 @@ from services.demonstrations.store import open_store
 from services.distributed.failures import Failure, read_failure
 from services.distributed.runner import LocalRunner
 from services.distributed.simulation_worker import SimulationWorker
+from services.distributed.work_items import AdaptationRollouts, ExpertAttempts
 from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoint
 
@@ -42,7 +43,8 @@ def run(arguments: Sequence[str]) -> None:
 
 def _attempt(failure: Failure, experiment: Experiment) -> Callable[[], object]:
     worker, piece = SimulationWorker(experiment.suite), failure.piece
-    return lambda: worker.attempts(str(piece["task"]), [int(piece["attempt"])], failure.config.demonstrations)
+    attempt = ExpertAttempts(str(piece["task"]), [int(piece["attempt"])], failure.config.demonstrations)
+    return lambda: worker.run(attempt)
 
 
 def _slot(failure: Failure, experiment: Experiment) -> Callable[[], object]:
@@ -64,12 +66,9 @@ def _slot(failure: Failure, experiment: Experiment) -> Callable[[], object]:
 def _adaptation(failure: Failure, experiment: Experiment) -> Callable[[], object]:
     runner = LocalRunner(experiment.suite)
     evaluator = experiment.evaluator(runner, experiment.collect(runner))
-    (call,) = (
-        call
-        for adaptation, call in zip(evaluator.adaptations, evaluator.calls(_checkpoint(failure)), strict=True)
-        if adaptation.piece == failure.piece
-    )
-    return lambda: list(runner.simulate("try_out", [call]))
+    items = evaluator.items(_checkpoint(failure), AdaptationRollouts)
+    (item,) = (item for item in items if item.key == failure.piece)
+    return lambda: list(runner.simulate([item]))
 
 
 def _checkpoint(failure: Failure) -> Checkpoint:

@@ -12,6 +12,7 @@ from dmil_core.statistics import success_rate
 from services.cli.arguments import Quiet, exit_code, parse
 from services.cli.composition import suite_settings
 from services.cli.progress import Bar, console
+from services.distributed.work_items import Verification
 from services.experiments.experiment import RunnerKind, open_runner
 from services.rollouts.verification import VerificationRow
 from services.suites.base import TaskSuite
@@ -55,11 +56,13 @@ def run(arguments: Sequence[str]) -> None:
             f"--seeds, --first-seed: got {given.seeds} from {given.first_seed} on; wanted at least one, none below 0"
         )
     seeds = range(given.first_seed, given.first_seed + given.seeds)
-    calls = [(task, seeds[at : at + CHUNK], given.noise) for task in tasks for at in range(0, len(seeds), CHUNK)]
+    items = [
+        Verification(task, seeds[at : at + CHUNK], given.noise) for task in tasks for at in range(0, len(seeds), CHUNK)
+    ]
     rows: list[VerificationRow] = []
     with open_runner(given.runner, suite, given.workers) as runner, Bar("verifying", len(tasks) * len(seeds)) as bar:
         try:
-            for _, made in runner.simulate("verify", calls):
+            for _, made in runner.simulate(items):
                 rows += made
                 bar.advance(len(made), made[0].task)
         except WorkError as error:

@@ -12,6 +12,7 @@ from services.demonstrations.external import check_dimensions, demonstrations, p
 from services.demonstrations.store import DemoStore, TaskDemonstrations
 from services.distributed.failures import keeping_failures
 from services.distributed.runner import Runner
+from services.distributed.work_items import ExpertAttempts
 from services.suites.base import Attempt, TaskSuite
 
 CHUNK = 10
@@ -129,7 +130,7 @@ class DemonstrationCollection:
 
         with Bar("collecting", len(tasks) * settings.per_task, 0, "demonstrations", figures) as bar:
             while attempts:
-                calls = []
+                items: list[ExpertAttempts] = []
                 for task in attempts:
                     first = len(attempts[task])
                     if first >= PATIENCE * settings.per_task:
@@ -139,18 +140,18 @@ class DemonstrationCollection:
                         )
                     for start in range(first, first + lacking(task), CHUNK):
                         numbers = range(start, min(start + CHUNK, first + lacking(task)))
-                        calls.append((task, numbers, settings))
+                        items.append(ExpertAttempts(task, numbers, settings))
                 results: dict[int, list[Attempt]] = {}
-                left = Counter(task for task, _, _ in calls)
+                left = Counter(item.task for item in items)
                 with keeping_failures(self._store.root, self._config):
-                    for index, made in runner.simulate("attempts", calls):
-                        task = calls[index][0]
+                    for index, made in runner.simulate(items):
+                        task = items[index].task
                         results[index] = made
                         left[task] -= 1
                         at = task
                         bar.advance(sum(attempt.solved_at is not None for attempt in made))
                         if not left[task]:
-                            own = [number for number, call in enumerate(calls) if call[0] == task]
+                            own = [number for number, item in enumerate(items) if item.task == task]
                             attempts[task] += [attempt for number in own for attempt in results.pop(number)]
                             if lacking(task) <= 0:
                                 yield task, attempts.pop(task)

@@ -1,42 +1,44 @@
-"""The runner that works in Ray actors."""
+"""The runner whose workers are Ray actors."""
 
 import logging
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from dmil_core.errors import WorkError
 from services.cli.live_view import Workers
+from services.distributed.calls import Call
 from services.distributed.cluster import cpus, joined
 from services.distributed.errors import DeadlyCallError
 from services.distributed.metrics import Meter, RayMeter, WorkerCounter
 from services.distributed.ray_meta_training import RayMetaTraining
 from services.distributed.runner import Plan
-from services.distributed.simulation_worker import SimulationWorker, piece_of_call
+from services.distributed.simulation_worker import SimulationWorker, WorkItem
 from services.suites.base import TaskSuite
 
 if TYPE_CHECKING:
     from services.distributed.actor_pool import Pool
-    from services.distributed.calls import Call
 
-POLITENESS = 10
-"""How far a simulation beside meta-training stands back, see `os.nice`."""
+NICENESS = 10
+"""Of the simulation worker in the background, see `os.nice`."""
 
 logger = logging.getLogger(__name__)
+T = TypeVar("T")
 
 
 class RayRunner:
-    """Does the work in Ray actors: those of the cluster this process belongs to, or of one on this machine alone."""
+    """Runs all work in Ray actors, of the cluster that this process belongs to or of one on this machine."""
 
     def __init__(self, suite: TaskSuite, workers: int | None, gpus: float = 0.0) -> None:
         """Join a cluster, or start one, see `services.distributed.cluster`.
 
         Args:
-            suite: whose tasks are worked on.
-            workers: of each kind; `None` takes one for each CPU of the cluster. Those that the cluster has no CPU for
-                join when it has: a cluster that grows by itself grows for them.
-            gpus: that each adaptation worker has to itself, which may be less than one.
+            suite: of the experiment's tasks.
+            workers: of each kind, by default one for each CPU of the cluster. Those that have no CPU yet join when
+                they have: an autoscaling cluster grows for them.
+            gpus: of each adaptation worker, which may be less than one.
         """
         self._cluster = ExitStack()
         self._cluster.enter_context(joined(workers))
@@ -45,24 +47,24 @@ class RayRunner:
         from services.distributed.actor_pool import Pool
 
         self._ray, self._pool = ray, Pool
-        self._asked_for, self._gpus = workers, gpus
+        self._requested, self._gpus = workers, gpus
         if workers is not None and workers > cpus():
             logger.info(f"--workers {workers}: the cluster has {cpus()} CPUs now; further workers join as it grows")
         self.meter: Meter = RayMeter(suite.name)
         self._counter = WorkerCounter("simulation", self.meter)
         self._suite = ray.put(suite)
-        self._beside: Pool | None = None
+        self._background: Pool | None = None
         self._training: RayMetaTraining | None = None
 
     @property
     def workers(self) -> int:
         """How many workers of each kind there may be now: nodes come and go."""
-        return min(self._wanted, cpus())
+        return min(self._wanted_workers, cpus())
 
     @property
-    def _wanted(self) -> int:
-        """How many there are to be, some of them when the cluster has grown."""
-        return self._asked_for or cpus()
+    def _wanted_workers(self) -> int:
+        """How many workers of each kind there are once the cluster has grown."""
+        return self._requested or cpus()
 
     @property
     def worker_counts(self) -> list[Workers]:
@@ -70,91 +72,83 @@ class RayRunner:
         counters = [self._counter] if self._training is None else [self._training.counter, self._counter]
         return [counter.count for counter in counters if counter.count != (counter.count.kind, 0, 0)]
 
-    def share(self, value: Any) -> Any:
-        """Put `value` into the object store."""
-        return self._ray.put(value)
+    def share(self, value: T) -> Callable[[], T]:
+        """Put `value` into the object store, and return a function that fetches it."""
+        return partial(self._ray.get, self._ray.put(value))
 
-    def simulate(self, method: str, calls: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
-        """Spread the calls over the simulation workers."""
+    def simulate(self, items: Sequence[WorkItem[T]]) -> Iterator[tuple[int, T]]:
+        """Spread the items over the simulation workers."""
         # While meta-training pauses, its workers keep their CPUs: the simulation's must not wait for one.
-        pausing = self._meta_training()
+        pausing = self._training is not None and self._training.alive
         remote = self._ray.remote(num_cpus=0 if pausing else 1)(SimulationWorker)
-        size = min(self.workers if pausing else self._wanted, len(calls))
+        size = min(self.workers if pausing else self._wanted_workers, len(items))
         pool = self._pool(lambda: remote.remote(self._suite), size, listener=self._counter, min_size=self.workers)
         try:
-            with naming_the_deadly():
-                yield from pool.results(_submitted(pool, method, calls))
+            with _naming_deadly_items():
+                yield from pool.results(_submit(pool, items))
         finally:
             pool.close()
 
-    def simulate_beside(self, method: str, calls: Sequence[tuple[Any, ...]]) -> "RaySimulation":
-        """Let one more worker make the calls, which gives way to meta-training and takes no CPU from its count."""
-        if self._beside is None:
-            remote = self._ray.remote(num_cpus=0)(PoliteSimulationWorker)
-            self._beside = self._pool(
-                lambda: remote.remote(self._suite), 1, max_in_flight=len(calls), listener=self._counter
+    def simulate_in_background(self, items: Sequence[WorkItem[T]]) -> "RaySimulation[T]":
+        """Run the items on one more worker, which gives way to meta-training and takes no CPU from its count."""
+        if self._background is None:
+            remote = self._ray.remote(num_cpus=0)(BackgroundSimulationWorker)
+            self._background = self._pool(
+                lambda: remote.remote(self._suite), 1, max_in_flight=len(items), listener=self._counter
             )
-        return RaySimulation(self._beside, method, calls)
+        return RaySimulation(self._background, items)
 
-    def meta_train(self, plan: Plan) -> "RayMetaTraining":
+    def meta_train(self, plan: Plan) -> RayMetaTraining:
         """Start the learner and the adaptation workers."""
         self._training = RayMetaTraining(
-            plan, lambda: self._wanted, gpus=self._gpus, meter=self.meter, min_workers=self.workers
+            plan, lambda: self._wanted_workers, gpus=self._gpus, meter=self.meter, min_workers=self.workers
         )
         return self._training
 
-    def _meta_training(self) -> bool:
-        return self._training is not None and self._training.alive
-
     def close(self) -> None:
-        """Leave the cluster; one that was started here ends."""
-        if self._beside is not None:
-            self._beside.close()
+        """Leave the cluster; one that was started here is stopped."""
+        if self._background is not None:
+            self._background.close()
         self._cluster.close()
 
 
-class PoliteSimulationWorker(SimulationWorker):
-    """A simulation worker that gives way to whatever else the machine has to do."""
+class BackgroundSimulationWorker(SimulationWorker):
+    """A simulation worker of low priority."""
 
     def __init__(self, suite: TaskSuite) -> None:
         """Simulate the tasks of `suite`."""
-        os.nice(POLITENESS)
+        os.nice(NICENESS)
         super().__init__(suite)
 
 
-class RaySimulation:
-    """Calls that one simulation worker makes, one after the other, while others do something else."""
+class RaySimulation(Generic[T]):
+    """Work items that one simulation worker runs in the background."""
 
-    def __init__(self, pool: "Pool", method: str, calls: Sequence[tuple[Any, ...]]) -> None:
-        """Begin to make the calls."""
-        self._pool = pool
-        self._calls = _submitted(pool, method, calls)
+    def __init__(self, pool: "Pool", items: Sequence[WorkItem[T]]) -> None:
+        """Submit the items."""
+        self._pool, self._calls = pool, _submit(pool, items)
 
     def done(self) -> bool:
-        """Tell, without waiting, whether all results are there."""
-        with naming_the_deadly():
+        """Return, without waiting, whether all results are there."""
+        with _naming_deadly_items():
             self._pool.poll()
         return all(call.done for call in self._calls)
 
-    def results(self) -> list[Any]:
-        """Wait for all results and return them in the order of the calls."""
-        with naming_the_deadly():
+    def results(self) -> list[T]:
+        """Wait for all results and return them in the order of the items."""
+        with _naming_deadly_items():
             return [self._pool.result(call) for call in self._calls]
 
 
-def _submitted(pool: "Pool", method: str, calls: Sequence[tuple[Any, ...]]) -> list["Call"]:
-    return [pool.submit(method, *arguments, label=piece_of_call(method, arguments)[0]) for arguments in calls]
+def _submit(pool: "Pool", items: Sequence[WorkItem[Any]]) -> list[Call]:
+    return [pool.submit("run", item, label=item.label) for item in items]
 
 
 @contextmanager
-def naming_the_deadly() -> Iterator[None]:
-    """Tell of a simulation that ends one worker after the other as of an error in it.
-
-    Raises:
-        WorkError: names it.
-    """
+def _naming_deadly_items() -> Iterator[None]:
+    """Raise a `WorkError` for an item during which one worker after the other died."""
     try:
         yield
     except DeadlyCallError as error:
-        _, piece = piece_of_call(error.call.method, error.call.arguments)
-        raise WorkError(error.call.label, str(error), str(error), piece) from error
+        (item,) = error.call.arguments
+        raise WorkError(item.label, str(error), str(error), item.key) from error

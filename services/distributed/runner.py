@@ -1,11 +1,11 @@
-"""Where an experiment's work is done: here, or by the actors of `ray_runner`, with the same bits."""
+"""Runners of an experiment's work, and the one in this process; that of `ray_runner` gives the same bits."""
 
 import math
 import signal
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import torch
 
@@ -17,9 +17,11 @@ from services.cli.live_view import Workers
 from services.distributed.adaptation_worker import AdaptationWorker, Block
 from services.distributed.learner import Learner
 from services.distributed.metrics import Meter
-from services.distributed.simulation_worker import SimulationWorker
+from services.distributed.simulation_worker import ResultOut, SimulationWorker, WorkItem
 from services.distributed.timing import Timing
 from services.suites.base import TaskSuite
+
+T = TypeVar("T")
 
 
 class Plan(NamedTuple):
@@ -34,9 +36,9 @@ class Plan(NamedTuple):
     settings: TrainingConfig
     seed: int
     skip_nonfinite: bool = False
-    """Whether an iteration whose step is not taken, for its gradient was not finite, counts as done."""
+    """Count an iteration as done whose step is not taken because its gradient is not finite."""
     suite: TaskSuite | None = None
-    """Where a method that practises does so."""
+    """Where a method that learns from rollouts in meta-training has them."""
 
     def tasks(self, iteration: int) -> list[str]:
         """Return the task of each slot of an iteration."""
@@ -44,7 +46,7 @@ class Plan(NamedTuple):
 
 
 class Iteration(NamedTuple):
-    """What came of one iteration."""
+    """The outcome of one iteration."""
 
     number: int
     """Outer steps done, this one included."""
@@ -58,15 +60,15 @@ class Iteration(NamedTuple):
 
     @property
     def stepped(self) -> bool:
-        """Whether the outer step was taken: by a gradient that is not finite, none is."""
+        """Whether the outer step was taken: a gradient that is not finite is skipped."""
         return math.isfinite(self.gradient_norm)
 
 
 class MetaTraining(Protocol):
-    """A learner and its adaptation workers, from one state to the next."""
+    """A learner and its adaptation workers."""
 
     def iterations(self, count: int) -> Iterator[Iteration]:
-        """Do the next `count` iterations. No outer step is taken before the iteration that it ends is asked for."""
+        """Run the next `count` iterations. No outer step is taken before its iteration is requested."""
         ...
 
     def state(self) -> OuterState:
@@ -74,54 +76,49 @@ class MetaTraining(Protocol):
         ...
 
     def close(self) -> None:
-        """Let the learner and the adaptation workers go."""
+        """Stop the learner and the adaptation workers."""
         ...
 
 
-class Simulation(Protocol):
-    """Calls of a simulation worker that were begun, and may still be under way."""
+class Simulation(Protocol[ResultOut]):
+    """Work items that were submitted, and may still be running."""
 
     def done(self) -> bool:
-        """Tell, without waiting, whether all results are there."""
+        """Return, without waiting, whether all results are there."""
         ...
 
-    def results(self) -> list[Any]:
-        """Wait for all results and return them in the order of the calls."""
+    def results(self) -> Sequence[ResultOut]:
+        """Wait for all results and return them in the order of the items."""
         ...
 
 
 class Runner(Protocol):
-    """Does an experiment's work, wherever that is."""
+    """Runs the work of an experiment, in this process or elsewhere."""
 
     @property
     def meter(self) -> Meter:
-        """Takes what is counted and measured of the work."""
+        """Records the metrics of the work."""
         ...
 
     @property
     def worker_counts(self) -> Sequence[Workers]:
-        """The workers that there are beside this process."""
+        """The workers of each kind that there are beside this process."""
         ...
 
-    @property
-    def workers(self) -> int:
-        """How many workers of each kind there may be now."""
+    def share(self, value: T) -> Callable[[], T]:
+        """Return a function that returns `value` in any process; in work items it travels to each node once."""
         ...
 
-    def share(self, value: Any) -> Any:
-        """Return what to pass in calls instead of `value`, so that it travels once."""
+    def simulate(self, items: Sequence[WorkItem[T]]) -> Iterator[tuple[int, T]]:
+        """Run work items on the simulation workers; yield each index and result as they arrive."""
         ...
 
-    def simulate(self, method: str, calls: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
-        """Call a method of the simulation workers with each of `calls`; yield index and result as they come."""
-        ...
-
-    def simulate_beside(self, method: str, calls: Sequence[tuple[Any, ...]]) -> Simulation:
-        """Begin to do the same beside meta-training; where only one thing can be done at a time, do it now."""
+    def simulate_in_background(self, items: Sequence[WorkItem[T]]) -> Simulation[T]:
+        """Start to run work items beside meta-training; in one process, run them now."""
         ...
 
     def meta_train(self, plan: Plan) -> MetaTraining:
-        """Make the learner and the adaptation workers."""
+        """Start the learner and the adaptation workers."""
         ...
 
     def close(self) -> None:
@@ -129,54 +126,56 @@ class Runner(Protocol):
         ...
 
 
-class Finished(NamedTuple):
-    """A simulation that is over."""
+class FinishedSimulation(Generic[T]):
+    """A simulation that has ended."""
 
-    outcomes: list[Any]
+    def __init__(self, results: list[T]) -> None:
+        """Hold the results."""
+        self._results = results
 
     def done(self) -> bool:
         """Return true."""
         return True
 
-    def results(self) -> list[Any]:
-        """Return them."""
-        return self.outcomes
+    def results(self) -> list[T]:
+        """Return the results."""
+        return self._results
 
 
 class LocalRunner:
-    """Does all work in this process: for tests, debuggers and notebooks."""
+    """Runs all work in this process: for tests, debuggers and notebooks."""
 
-    workers = 1
     meter = Meter()
     worker_counts = ()
 
     def __init__(self, suite: TaskSuite) -> None:
-        """Work on the tasks of `suite`."""
-        self._simulation = SimulationWorker(suite)
+        """Simulate the tasks of `suite`; until it is closed, torch computes on one thread, as in Ray's workers."""
+        self._threads = torch.get_num_threads()
+        self._worker = SimulationWorker(suite)
 
-    def share(self, value: Any) -> Any:
-        """Return `value`."""
-        return value
+    def share(self, value: T) -> Callable[[], T]:
+        """Return a function that returns `value`."""
+        return lambda: value
 
-    def simulate(self, method: str, calls: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
-        """Make the calls one after the other."""
-        for index, call in enumerate(calls):
-            yield index, getattr(self._simulation, method)(*call)
+    def simulate(self, items: Sequence[WorkItem[T]]) -> Iterator[tuple[int, T]]:
+        """Run the items one after the other."""
+        return enumerate(map(self._worker.run, items))
 
-    def simulate_beside(self, method: str, calls: Sequence[tuple[Any, ...]]) -> Finished:
-        """Make the calls now: they take their turn."""
-        return Finished([outcome for _, outcome in self.simulate(method, calls)])
+    def simulate_in_background(self, items: Sequence[WorkItem[T]]) -> FinishedSimulation[T]:
+        """Run the items now."""
+        return FinishedSimulation([self._worker.run(item) for item in items])
 
     def meta_train(self, plan: Plan) -> "LocalMetaTraining":
-        """Make the learner and one adaptation worker."""
+        """Return the learner with one adaptation worker."""
         return LocalMetaTraining(plan)
 
     def close(self) -> None:
-        """Nothing to stop."""
+        """Give torch its threads back."""
+        torch.set_num_threads(self._threads)
 
 
 class LocalMetaTraining:
-    """Computes all slots one after the other."""
+    """Meta-training in this process, one slot after the other."""
 
     def __init__(self, plan: Plan) -> None:
         """Start from the plan's state."""
@@ -186,11 +185,11 @@ class LocalMetaTraining:
         self._ready, self._parameters = self._learner.parameters()
 
     def iterations(self, count: int) -> Iterator[Iteration]:
-        """Do the next `count` iterations, with all groups as one block."""
+        """Run the next `count` iterations, with all groups as one block."""
         for _ in range(count):
             block = Block(self._next, self._plan.tasks(self._next), groups(self._plan.settings))
             report, gradient = self._worker.gradient(self._parameters, block)
-            with _undisturbed():
+            with _signals_deferred():
                 stepped, self._parameters = self._learner.step(gradient)
             timing = Timing.of(self._ready, {0: [report.span]}, stepped.span)
             self._next, self._ready = self._next + 1, stepped.span.ended
@@ -201,24 +200,24 @@ class LocalMetaTraining:
         return self._learner.state()
 
     def close(self) -> None:
-        """Nothing to let go."""
+        """Nothing to stop."""
 
 
 @contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM wait: a step of Adam cut in the middle is no state to go on from."""
+def _signals_deferred() -> Iterator[None]:
+    """Defer Ctrl-C and SIGTERM: a step of Adam that is interrupted leaves no state to continue from."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    waiting: list[int] = []
-    before = {
-        number: signal.signal(number, lambda number, frame: waiting.append(number))
+    deferred: list[int] = []
+    handlers = {
+        number: signal.signal(number, lambda number, frame: deferred.append(number))
         for number in (signal.SIGINT, signal.SIGTERM)
     }
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)
-        for number in waiting:
+        for number in deferred:
             signal.raise_signal(number)

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from services.demonstrations.store import TaskDemonstrations
 from services.distributed.failures import keeping_failures
 from services.distributed.metrics import EPISODES, SUCCESS_RATE, SUCCESSES, Meter
 from services.distributed.runner import Runner, Simulation
+from services.distributed.work_items import AdaptationItem, AdaptationRollouts
 from services.evaluation.results import AdaptationResult, EpisodeResult, ImitationResult, write_rows
 from services.evaluation.summary import Evaluation, cells, rates, sub_skill_use
 from services.rollouts.adaptations import Adaptation, AdaptationOutcome, Imitation, plan_adaptations
@@ -25,6 +26,8 @@ from services.suites.base import Split, TaskSuite
 from services.tracking import Tracker
 
 logger = logging.getLogger(__name__)
+
+Item = TypeVar("Item", bound=AdaptationItem)
 
 
 class Tallies:
@@ -86,16 +89,12 @@ class Evaluator:
         every = self.config.evaluation.every
         return every is not None and 0 < iteration < self.config.training.iterations and iteration % every == 0
 
-    def calls(self, checkpoint: Checkpoint) -> list[tuple[Any, ...]]:
-        """Return the arguments of `SimulationWorker.try_out`, and of its `imitate`, for each adaptation.
-
-        The checkpoint is not read again.
-        """
+    def items(self, checkpoint: Checkpoint, kind: type[Item]) -> list[Item]:
+        """Return a work item of `kind` for each adaptation; the checkpoint is not read again."""
         method, shapes = checkpoint.method(self._suite.action_dim), checkpoint.manifest.torch_shapes
-        parameters = self._runner.share(checkpoint.state.parameters)
-        config = self.config
+        parameters, config = self._runner.share(checkpoint.state.parameters), self.config
         return [
-            (method, parameters, shapes, adaptation, self._shared[adaptation.task], config.evaluation, config.seed)
+            kind(method, shapes, parameters, adaptation, self._shared[adaptation.task], config.evaluation, config.seed)
             for adaptation in self.adaptations
         ]
 
@@ -112,7 +111,7 @@ class Evaluator:
         return Evaluation(checkpoint, suite.protocol, suite.best_score, failed, held, episodes, adaptations)
 
     def imitation(self, checkpoint: Checkpoint, outcomes: Iterable[Imitation]) -> list[ImitationResult]:
-        """Return a row for each adaptation, from what `SimulationWorker.imitate` found in them in their order."""
+        """Return a row for each adaptation, from their `AdaptationImitation` in order."""
         return [
             ImitationResult.model_validate(
                 {
@@ -166,7 +165,7 @@ class Evaluations:
         self._runner, self._evaluator, self._checkpoints, self._tracker = runner, evaluator, checkpoints, tracker
         self._folder = checkpoints.folder.with_name("evaluations")
         self._overlap = overlap
-        self._under_way: tuple[Checkpoint, Simulation] | None = None
+        self._under_way: tuple[Checkpoint, Simulation[AdaptationOutcome]] | None = None
         self.latest: dict[str, Any] = {}
         """What the last one came to, as fields of `Figures`: the ``success``, and ``after`` how many iterations."""
 
@@ -190,13 +189,13 @@ class Evaluations:
     def begin(self, checkpoint: Checkpoint) -> None:
         """Evaluate a checkpoint."""
         self.finish()
-        calls = self._evaluator.calls(checkpoint)
+        items = self._evaluator.items(checkpoint, AdaptationRollouts)
         with self._keeping_failures(checkpoint):
             if self._overlap:
-                self._under_way = checkpoint, self._runner.simulate_beside("try_out", calls)
+                self._under_way = checkpoint, self._runner.simulate_in_background(items)
             else:
-                outcomes = dict(self._runner.simulate("try_out", calls))
-                self._record(checkpoint, [outcomes[index] for index in range(len(calls))])
+                outcomes = dict(self._runner.simulate(items))
+                self._record(checkpoint, [outcomes[index] for index in range(len(items))])
 
     def _keeping_failures(self, checkpoint: Checkpoint) -> AbstractContextManager[None]:
         return keeping_failures(self._folder.parent, self._evaluator.config, lambda: checkpoint.path)

@@ -20,6 +20,7 @@ from services.demonstrations.store import DemoStore, TaskDemonstrations
 from services.distributed.failures import keeping_failures
 from services.distributed.ray_runner import RayRunner
 from services.distributed.runner import LocalRunner, Plan, Runner
+from services.distributed.work_items import AdaptationRollouts
 from services.evaluation.evaluator import Evaluations, Evaluator, Tallies, write_evaluation
 from services.evaluation.summary import Evaluation
 from services.experiments.meta_training import CheckpointWriter, IterationLog, meta_train
@@ -209,7 +210,7 @@ class Experiment:
             Bar("evaluating", sum(len(each.episodes) for each in evaluator.adaptations), 0, "episodes", figures) as bar,
             keeping_failures(folder, self.config, lambda: checkpoint.path),
         ):
-            for index, outcome in runner.simulate("try_out", evaluator.calls(checkpoint)):
+            for index, outcome in runner.simulate(evaluator.items(checkpoint, AdaptationRollouts)):
                 outcomes[index] = outcome
                 adaptation = evaluator.adaptations[index]
                 tallies.add(adaptation, outcome)

@@ -16,6 +16,7 @@ from dmil_core.statistics import Rate, success_rate
 from services.cli.composition import with_evaluation
 from services.cli.progress import Bar, console
 from services.distributed.runner import Runner
+from services.distributed.work_items import AdaptationImitation
 from services.evaluation.evaluator import Evaluator
 from services.evaluation.results import EpisodeResult, ImitationResult, read_rows, write_rows
 from services.experiments.experiment import Experiment
@@ -178,7 +179,7 @@ def _measure_imitation(run: FinishedRun, runner: Runner, evaluator: Evaluator, f
     """Compare the adapted policies with demonstrations, and write a row for each."""
     outcomes = {}
     with Bar("comparing with demonstrations", len(evaluator.adaptations)) as bar:
-        for index, outcome in runner.simulate("imitate", evaluator.calls(run.checkpoint)):
+        for index, outcome in runner.simulate(evaluator.items(run.checkpoint, AdaptationImitation)):
             outcomes[index] = outcome
             bar.advance(1, evaluator.adaptations[index].task)
     in_order = [outcomes[index] for index in range(len(outcomes))]

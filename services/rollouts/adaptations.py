@@ -25,13 +25,13 @@ class Adaptation(NamedTuple):
     episodes: tuple[int, ...]
 
     @property
-    def in_words(self) -> str:
+    def label(self) -> str:
         """Its name in messages."""
         return f"{self.split} task {self.task}, {self.shots}-shot, support set {self.draw}"
 
     @property
-    def piece(self) -> dict[str, str | int]:
-        """What names it among all adaptations."""
+    def key(self) -> dict[str, str | int]:
+        """What identifies it among all adaptations."""
         return {"split": self.split, "task": self.task, "shots": self.shots, "draw": self.draw}
 
     def support(self, held_out: Sequence[Demonstration]) -> Sequence[Demonstration]:

@@ -22,6 +22,7 @@ from services.cli.arguments import exit_code
 from services.demonstrations.store import DemoStore, TaskDemonstrations
 from services.distributed.failures import read_failure
 from services.distributed.ray_meta_training import RayMetaTraining
+from services.distributed.ray_runner import RayRunner
 from services.distributed.runner import LocalRunner
 from services.distributed.simulation_worker import SimulationWorker
 from services.experiments.experiment import Experiment, open_runner
@@ -139,10 +140,10 @@ def test_a_trial_that_ends_its_workers_is_named(
     train("run", "--training.iterations", "1")
 
     class Deadly(SimulationWorker):
-        def try_out(self, method, parameters, shapes, adaptation, held_out, evaluation, seed):
-            if adaptation.task == "push":
+        def run(self, item):
+            if item.key["task"] == "push":
                 os.kill(os.getpid(), signal.SIGKILL)
-            return super().try_out(method, parameters, shapes, adaptation, held_out, evaluation, seed)
+            return super().run(item)
 
     monkeypatch.setattr("services.distributed.ray_runner.SimulationWorker", Deadly)
     assert exit_code(meta_train.run, ["--resume", "run", "--runner", "ray", "--workers", "2"]) == 1
@@ -175,6 +176,7 @@ def test_nodes_may_leave_and_join(
     wanted = alone(several, data)
     leaving = nodes.add_node(num_cpus=1, object_store_memory=100_000_000)
     with open_runner("ray", several.suite, asked) as runner:
+        assert isinstance(runner, RayRunner)
         assert runner.workers == 3
         meta_training = runner.meta_train(plan_of(several, data))
         assert isinstance(meta_training, RayMetaTraining)
@@ -266,7 +268,7 @@ def test_a_failing_expert_and_a_failing_trial_are_named(
     train("run", "--training.iterations", "1")
     capsys.readouterr()
     with monkeypatch.context() as patch:
-        patch.setattr("services.distributed.simulation_worker.try_out", lambda *given: 1 / 0)
+        patch.setattr("services.distributed.work_items.try_out", lambda *given: 1 / 0)
         assert exit_code(meta_train.run, ["--resume", "run", "--runner", "local"]) == 1
         said = capsys.readouterr().err
         assert "meta-training task reach, 1-shot, support set 0, seed 0: ZeroDivisionError: division by zero" in said
@@ -277,7 +279,7 @@ def test_a_failing_expert_and_a_failing_trial_are_named(
 
     monkeypatch.setenv("DMIL_DATA", str(workplace / "data"))
     with monkeypatch.context() as patch:
-        patch.setattr("services.distributed.simulation_worker.demonstrate", lambda *given: 1 / 0)
+        patch.setattr("services.distributed.work_items.demonstrate", lambda *given: 1 / 0)
         arguments = ["--preset", "ml10-smoke", "--runner", "local", "--name", "other"]
         assert exit_code(meta_train.run, arguments) == 1
     said = capsys.readouterr().err
@@ -387,7 +389,7 @@ def test_checkpoints_wait_for_their_evaluation(workplace: Path, train, monkeypat
         def results(self) -> list:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(LocalRunner, "simulate_beside", lambda *given: Never())
+    monkeypatch.setattr(LocalRunner, "simulate_in_background", lambda *given: Never())
     schedule = ("--training.checkpoint-every", "1", "--training.checkpoints-kept", "1", "--evaluation.every", "2")
     with pytest.raises(KeyboardInterrupt):
         train("run", "--training.iterations", "6", *schedule)

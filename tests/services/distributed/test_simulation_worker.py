@@ -5,6 +5,7 @@ import pytest
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
 from services.distributed import simulation_worker
 from services.distributed.simulation_worker import SimulationWorker
+from services.distributed.work_items import ExpertAttempts
 from services.suites.base import Environment
 from services.suites.metaworld import MetaWorldSuite
 
@@ -25,9 +26,10 @@ def test_environments_are_built_once_and_used_again():
     suite = CountingSuite()
     worker = SimulationWorker(suite)
     attempts = {
-        task: [worker.attempts(task, [0, 1], DemonstrationConfig()) for _ in range(2)] for task in ("reach", "push")
+        task: [worker.run(ExpertAttempts(task, [0, 1], DemonstrationConfig())) for _ in range(2)]
+        for task in ("reach", "push")
     }
-    again = worker.attempts("reach", [0, 1], DemonstrationConfig())
+    again = worker.run(ExpertAttempts("reach", [0, 1], DemonstrationConfig()))
     assert suite.built == ["reach", "push"]
     for first, second in zip(attempts["reach"][0], again, strict=True):
         assert first.goal == second.goal
@@ -39,5 +41,5 @@ def test_the_task_longest_unused_makes_room(monkeypatch: pytest.MonkeyPatch):
     suite = CountingSuite()
     worker = SimulationWorker(suite)
     for task in ("reach", "push", "reach", "sweep", "reach", "push"):
-        worker.attempts(task, [0], DemonstrationConfig())
+        worker.run(ExpertAttempts(task, [0], DemonstrationConfig()))
     assert suite.built == ["reach", "push", "sweep", "push"]

@@ -27,9 +27,9 @@ class Counting(LocalRunner):
 
     calls = 0
 
-    def simulate(self, method, calls):
-        self.calls += len(calls)
-        return super().simulate(method, calls)
+    def simulate(self, items):
+        self.calls += len(items)
+        return super().simulate(items)
 
 
 def counting(run: FinishedRun) -> Counting:

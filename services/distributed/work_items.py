@@ -1,0 +1,127 @@
+"""The kinds of simulation: attempts of experts, and adaptations of checkpoints."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from dmil_core.configs import DemonstrationConfig, EvaluationConfig
+from dmil_core.demonstrations import Demonstration
+from dmil_core.errors import as_work_error
+from dmil_core.methods.base import Method
+from dmil_core.networks import Parameters, unflatten
+from dmil_core.seeding import named_seed
+from services.distributed.simulation_worker import SimulationWorker
+from services.rollouts.adaptations import Adaptation, AdaptationOutcome, Imitation, imitate, try_out
+from services.rollouts.episodes import demonstrate
+from services.rollouts.verification import VerificationRow, verify
+from services.suites.base import Attempt
+
+
+@dataclass(frozen=True)
+class ExpertAttempts:
+    """Attempts of a task's expert, one for each of `numbers`."""
+
+    task: str
+    numbers: Sequence[int]
+    config: DemonstrationConfig
+
+    @property
+    def label(self) -> str:
+        """Its name in messages."""
+        return f"task {self.task}, attempts {self.numbers[0]} to {self.numbers[-1]}"
+
+    @property
+    def key(self) -> dict[str, str | int]:
+        """The first of its attempts, which identifies it in ``failure.json``."""
+        return {"task": self.task, "attempt": self.numbers[0]}
+
+    def run(self, worker: SimulationWorker) -> list[Attempt]:
+        """Return the attempts.
+
+        Raises:
+            WorkError: names the attempt in which there was a Python error.
+        """
+        (env, *_), expert = worker.environments(self.task, 1), worker.suite.expert(self.task)
+        assert expert is not None
+        steps, attempts = self.config.steps(self.task, worker.suite.horizon), []
+        for number in self.numbers:
+            seed = named_seed(self.config.seed, "demonstration", self.task, number)
+            with as_work_error(f"task {self.task}, attempt {number}, seed {seed}", task=self.task, attempt=number):
+                attempts.append(demonstrate(expert, env, seed, steps, self.config))
+        return attempts
+
+
+@dataclass(frozen=True)
+class Verification:
+    """One attempt of a task's expert for each seed, see `services.rollouts.verification`."""
+
+    task: str
+    seeds: Sequence[int]
+    noise: float
+
+    @property
+    def label(self) -> str:
+        """Its name in messages."""
+        return f"task {self.task}, seeds {self.seeds[0]} to {self.seeds[-1]}"
+
+    @property
+    def key(self) -> dict[str, str | int]:
+        """The first of its seeds, which identifies it in ``failure.json``."""
+        return {"task": self.task, "seed": self.seeds[0]}
+
+    def run(self, worker: SimulationWorker) -> list[VerificationRow]:
+        """Return a row for each attempt."""
+        return verify(worker.suite, self.task, self.seeds, self.noise)
+
+
+@dataclass(frozen=True)
+class AdaptationItem:
+    """An adaptation, with what it starts from; the subclasses judge the adapted policy."""
+
+    method: Method
+    shapes: Mapping[str, torch.Size]
+    """Names and shapes of the parameters, in the order in which they are laid out flat."""
+    flat_parameters: Callable[[], Float32[np.ndarray, " size"]]
+    """As `Runner.share` returns them."""
+    adaptation: Adaptation
+    held_out: Callable[[], Sequence[Demonstration]]
+    """Demonstrations of the task that support sets are drawn from, as `Runner.share` returns them."""
+    evaluation: EvaluationConfig
+    seed: int
+    """Of the experiment."""
+
+    @property
+    def label(self) -> str:
+        """Its name in messages."""
+        return f"{self.adaptation.label}, seed {self.seed}"
+
+    @property
+    def key(self) -> dict[str, str | int]:
+        """What identifies it in ``failure.json``."""
+        return self.adaptation.key
+
+    def parameters(self) -> Parameters:
+        """Return a copy of the parameters to adapt."""
+        return unflatten(torch.tensor(self.flat_parameters()), self.shapes)
+
+
+class AdaptationRollouts(AdaptationItem):
+    """Judges an adapted policy by episodes."""
+
+    def run(self, worker: SimulationWorker) -> AdaptationOutcome:
+        """Adapt, and run the episodes."""
+        envs, horizon = worker.environments(self.adaptation.task, len(self.adaptation.episodes)), worker.suite.horizon
+        return try_out(
+            self.method, self.parameters(), self.adaptation, self.held_out(), envs, horizon, self.evaluation, self.seed
+        )
+
+
+class AdaptationImitation(AdaptationItem):
+    """Judges an adapted policy by its distance from demonstrations."""
+
+    def run(self, worker: SimulationWorker) -> Imitation:
+        """Adapt, and compare the policy with demonstrations; nothing is simulated."""
+        return imitate(self.method, self.parameters(), self.adaptation, self.held_out(), self.evaluation)
