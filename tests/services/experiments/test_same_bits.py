@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from dmil_core.methods.base import FineTuning, MetaLearner, PractisingLearner
+from dmil_core.methods.base import FineTuning, MetaLearner, OnlineMetaLearner
 from dmil_core.methods.registry import OURS, method_type
 from services import meta_train
 from services.demonstrations.store import DemoStore
@@ -58,7 +58,7 @@ def test_a_run_of_each_method_comes_to_its_table(runs: Path, method: str):
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["method"] == method
     kind = OURS[method]
-    assert bool(summary["environment_steps"]) == issubclass(kind, PractisingLearner)
+    assert bool(summary["environment_steps"]) == issubclass(kind, OnlineMetaLearner)
     if not issubclass(kind, MetaLearner):
         assert whole.manifest.iteration == 0
 
