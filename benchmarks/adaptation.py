@@ -22,8 +22,9 @@ from benchmarks.workload import ACTION_DIM, OBS_DIM, as_in_a_run, draw_parameter
 from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.methods.base import FineTuning
 from dmil_core.methods.dmil.adaptation import Hierarchy, adapt
-from dmil_core.methods.dmil.method import DmilPolicy
-from dmil_core.methods.mil.method import Mil, MilConfig
+from dmil_core.methods.dmil.policy import DmilPolicy
+from dmil_core.methods.mil.config import MilConfig
+from dmil_core.methods.mil.method import Mil
 from dmil_core.seeding import named_rng
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
@@ -100,7 +101,7 @@ def _dmil(given: Arguments) -> list[Contest]:
     twin, hierarchy = MaskedTwin(config), Hierarchy.of(as_in_a_run(parameters))
 
     def ours() -> Hierarchy:
-        return adapt(hierarchy, support, support, config, steps=steps).hierarchy
+        return adapt(hierarchy, support, support, config, steps=steps)
 
     def theirs() -> dict[str, Tensor]:
         return {name: tensor.detach() for name, tensor in twin.adapt(parameters, support, steps, rate).items()}

@@ -27,9 +27,9 @@ class SuiteConfig(Settings):
     goal_visible: bool = True
     """Whether a policy sees where the goal is; Meta-World's own meta-learning benchmarks hide it."""
     start_noise: NotNegative = 1.0
-    """How far the starts of a kitchen's episodes differ: 1 is as far as those of its real demonstrations."""
+    """Spread of the initial states of a kitchen's episodes: 1 is that of its real demonstrations."""
     horizon: Size | None = None
-    """Steps in an episode, if not the suite's."""
+    """Steps in an episode, in place of the suite's."""
     train_tasks: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     """Use these meta-training tasks instead of all of the suite's."""
     test_tasks: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
@@ -45,23 +45,23 @@ class DemonstrationConfig(Settings):
     """Where demonstrations come from, and how the scripted experts make them."""
 
     source: str = "expert"
-    """Where they come from: the suite's scripted experts, or minari:ID,ID, npz:PATH,PATH or hdf5:PATH,PATH, each the
-    data set of one task, which is named as TASK=ID, or else by the ID's last part."""
+    """Source of the demonstrations: expert (the suite's scripted experts), or minari:ID,ID, npz:PATH,PATH or
+    hdf5:PATH,PATH, each the data set of one task, which is named as TASK=ID or else by the ID's last part."""
     per_task: Size = 100
-    """Demonstrations of each task, training and held-out ones together; of a source of one's own, at most so many."""
+    """Demonstrations of each task, training and held-out ones together; another source may have fewer."""
     held_out: Size = 20
-    """Of these, how many are kept from meta-training, as support sets for evaluation."""
+    """Demonstrations of each task that are held out from meta-training, as support sets for evaluation."""
     noise: NotNegative = 0.1
     """Standard deviation of the noise added to the action that the expert's environment executes."""
     labels: Literal["clean", "noisy"] = "clean"
-    """Which action is stored: the expert's own, or the one with the noise, which was executed."""
+    """Action that is stored: clean is the expert's own, noisy the executed one."""
     trailing_steps: Annotated[int, Field(ge=0, le=10**9)] = 10
     """Steps recorded after the task is solved."""
     longest: Size | Literal["reference"] | None = None
-    """An attempt is given up after so many steps; reference: the limits of the authors' released code, 100 for most
-    tasks; none: the suite's horizon."""
+    """Steps after which an attempt fails; reference: the limits of the authors' released code, 100 for most tasks;
+    none: the suite's horizon."""
     seed: Seed = 0
-    """Names the demonstrations; they do not depend on the experiment's seed."""
+    """Seed of the demonstrations, which do not depend on the experiment's seed."""
 
     def steps(self, task: str, horizon: int) -> int:
         """Return after how many steps an attempt at `task` is given up."""
@@ -85,35 +85,36 @@ class TrainingConfig(Settings):
     tasks_per_iteration: Size = 10
     """Tasks in a batch, sampled without replacement where there are enough."""
     slots_per_group: Size = 1
-    """Tasks whose gradients one worker computes and adds together; part of the result, unlike the number of workers."""
+    """Tasks whose gradients one worker adds; it affects the result, unlike the number of workers."""
     outer_step: Literal["adam", "average"] = "adam"
-    """What an iteration does with its slots' gradients: a step of Adam by their sum; or, for a method whose slots take
-    steps of their own and return how far they went, the way to their mean."""
+    """adam takes a step of Adam by the sum of the slots' gradients; average moves to the mean of the slots' parameters,
+    for a method whose slots take steps of their own."""
     learning_rate: Positive = 1e-4
-    """β of the outer Adam (Table 9); of the way to the mean, the part that is gone."""
+    """Outer learning rate β of Adam (Table 9). With outer_step=average: the fraction of the way to the mean of the
+    slots' parameters."""
     gradient_clip: Positive | None = None
     """Clip the outer gradient to this norm."""
     checkpoint_every: Count = 200
     """Iterations between checkpoints."""
     checkpoints_kept: Count = 3
-    """The newest so many checkpoints are kept, besides the best."""
+    """Newest checkpoints that are kept, besides the best one."""
 
 
 class EvaluationConfig(Settings):
-    """Few-shot adaptation and the episodes that judge it."""
+    """Few-shot adaptation and its test episodes."""
 
     shots: Annotated[tuple[Size, ...], Field(min_length=1, max_length=100)] = (1, 3)
     """Sizes of the support set."""
     episodes: Size = 20
     """Episodes of each task for each size (Table 4)."""
     support_draws: Size = 4
-    """Different support sets that a task's episodes are spread over."""
+    """Disjoint support sets of each task, over which its episodes are spread."""
     fine_tuning_steps: Annotated[int, Field(ge=0, le=10**9)] = 50
     """Steps of adaptation to the support set (E.4)."""
     learning_rate: Positive = 1e-2
-    """Of this adaptation (E.4)."""
+    """Learning rate of adaptation (E.4)."""
     every: Count | None = None
-    """Evaluate every so many iterations of meta-training too: checkpoints, and so a multiple of checkpoint_every."""
+    """Iterations between evaluations, a multiple of checkpoint_every; none evaluates at the end alone."""
 
 
 def _method_settings(given: object) -> object:
@@ -127,7 +128,7 @@ class ExperimentConfig(Settings):
     """One experiment; with its data it determines every number that comes out."""
 
     seed: Seed = 0
-    """Of the initial parameters, the task batches and the episodes."""
+    """Seed of the initial parameters, the task batches and the episodes."""
     suite: SuiteConfig = SuiteConfig()
     demonstrations: DemonstrationConfig = DemonstrationConfig()
     method: Annotated[SerializeAsAny[MethodConfig], BeforeValidator(_method_settings)] = DmilConfig()
@@ -165,7 +166,7 @@ class ExperimentConfig(Settings):
         return self
 
 
-SIZES: dict[str, ExperimentConfig] = {
+BASE_PRESETS: dict[str, ExperimentConfig] = {
     "paper": ExperimentConfig(),
     "quick": ExperimentConfig(
         training=TrainingConfig(
@@ -181,8 +182,9 @@ SIZES: dict[str, ExperimentConfig] = {
         evaluation=EvaluationConfig(episodes=2, support_draws=1, fine_tuning_steps=5),
     ),
 }
-"""What the sizes are before a method's own `MethodConfig.sizes`: the paper's Table 9 to the letter; some minutes on two
-cores; a minute, to see that all works."""
+"""Settings of each preset before those of `MethodConfig.presets`.
+
+paper is Table 9 to the letter, quick trains in minutes on two cores, smoke runs everything in a minute."""
 
 SMOKE_TASKS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "ml10": (("reach", "push", "drawer-close"), ("door-close",)),
@@ -194,32 +196,32 @@ SMOKE_TASKS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "kitchen-kettle": (("microwave", "slide"), ("kettle",)),
     "kitchen-slide": (("microwave", "light"), ("slide",)),
 }
-"""A few meta-training and meta-testing tasks of each suite, for the size smoke."""
+"""A few meta-training and meta-testing tasks of each suite, for the preset smoke."""
 
 
-def preset_of(suite: str, size: str, method: str = DEFAULT_METHOD) -> ExperimentConfig:
-    """Return the settings of a size for a suite and a method.
+def preset_of(suite: str, preset: str, method: str = DEFAULT_METHOD) -> ExperimentConfig:
+    """Return the settings of a preset for a suite and a method.
 
     Raises:
-        KeyError: for a size that there is not.
-        MethodError: for a method that there is not.
+        KeyError: for an unknown preset.
+        MethodError: for an unknown method.
     """
-    config, own = SIZES[size], config_type(method)
+    config, own = BASE_PRESETS[preset], config_type(method)
     changes: dict[str, dict[str, Any]] = {"method": {"name": method}, "suite": {"name": suite}}
-    if size == "smoke" and suite in SMOKE_TASKS:
+    if preset == "smoke" and suite in SMOKE_TASKS:
         changes["suite"] |= dict(zip(("train_tasks", "test_tasks"), SMOKE_TASKS[suite], strict=True))
     if suite.startswith("kitchen"):
         if "sub_skills" in own.model_fields:
             changes["method"]["sub_skills"] = 4  # Table 5's middle column
-        if size == "quick":
+        if preset == "quick":
             changes["demonstrations"] = {"per_task": 50, "held_out": 12}  # a demonstration takes 1 s
     settings = config.model_dump(exclude={"method"}) | {"method": {}}
-    for changed in (own.sizes.get(size, {}), changes):
+    for changed in (own.presets.get(preset, {}), changes):
         settings |= {section: settings[section] | values for section, values in changed.items()}
     return ExperimentConfig.model_validate(settings)
 
 
 PRESETS: dict[str, ExperimentConfig] = {
-    f"{suite}-{size}": preset_of(suite, size) for suite in SMOKE_TASKS for size in SIZES
+    f"{suite}-{preset}": preset_of(suite, preset) for suite in SMOKE_TASKS for preset in BASE_PRESETS
 }
-"""The settings of each size for each suite of the paper."""
+"""Settings of each preset for each suite of the paper."""

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dmil_core.demonstrations import Demonstration, Normalisation
+from dmil_core.networks import Network, mlp
 
 Targets: TypeAlias = Int[Tensor, " steps"] | Float[Tensor, "steps sub_skills"]
 """What the high level should predict at each step: a sub-skill, or a weight for each."""
@@ -70,6 +71,11 @@ def squared_errors(
 ) -> Float[Tensor, " steps"]:
     """Return ‖π_k(s_t) − a_t‖² for each step."""
     return (predictions - actions).square().sum(-1)
+
+
+def bank_errors(networks: Sequence[Network], steps: Steps) -> Float[Tensor, "sub_skills steps"]:
+    """Return ‖π_k(s_t) − a_t‖² of every network at every step."""
+    return torch.stack([squared_errors(mlp(network, steps.states), steps.actions) for network in networks])
 
 
 def sub_skill_labels(errors: Float[Tensor, "sub_skills steps"]) -> Int[Tensor, " steps"]:

@@ -102,6 +102,35 @@ def own_states(chosen: Int[Tensor, " steps"], networks: int) -> list[Int[Tensor,
     return list(order.split(torch.bincount(chosen, minlength=networks).tolist()))
 
 
+def routed(
+    networks: Sequence[Network], states: Float[Tensor, "steps obs_dim"], chosen: Int[Tensor, " steps"]
+) -> Float[Tensor, "steps outputs"]:
+    """Return at each state the output of its chosen network, which alone is computed there."""
+    own = own_states(chosen, len(networks))
+    used = [k for k, index in enumerate(own) if len(index)] or [0]
+    if len(used) == 1:
+        return mlp(networks[used[0]], states)
+    return torch.cat([mlp(networks[k], states[own[k]]) for k in used])[torch.cat(own).argsort()]
+
+
+def leaves(parameters: Parameters, *, copy: bool = False) -> dict[str, Tensor]:
+    """Return the parameters as leaves of a new graph; a copy may be changed in place."""
+    detached = {name: tensor.detach() for name, tensor in parameters.items()}
+    return {name: (tensor.clone() if copy else tensor).requires_grad_() for name, tensor in detached.items()}
+
+
+def without_graph(parameters: Parameters) -> dict[str, Tensor]:
+    """Return the parameters detached from any graph; no copy."""
+    return {name: tensor.detach() for name, tensor in parameters.items()}
+
+
+def descend(optimiser: torch.optim.Optimizer, loss: Float[Tensor, ""]) -> None:
+    """Take one step of an optimiser down a loss."""
+    optimiser.zero_grad()
+    loss.backward()
+    optimiser.step()
+
+
 def flatten(parameters: Parameters) -> Float[Tensor, " size"]:
     """Copy all parameters into one vector, in their order; of a matrix, one column after the other.
 
@@ -125,3 +154,10 @@ def unflatten(vector: Float[Tensor, " size"], like: Mapping[str, torch.Size]) ->
         else:
             views[name] = piece.view(shape)
     return views
+
+
+def zeros_like(parameters: Parameters) -> tuple[Float[Tensor, " size"], Parameters]:
+    """Return a flat vector of zeros, and views into it with the parameters' names and shapes."""
+    first = next(iter(parameters.values()))
+    vector = torch.zeros(sum(tensor.numel() for tensor in parameters.values()), dtype=first.dtype)
+    return vector, unflatten(vector, {name: tensor.shape for name, tensor in parameters.items()})

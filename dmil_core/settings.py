@@ -1,4 +1,4 @@
-"""What all settings are made of: counts, rates and seeds within their bounds, and the base of a method's own."""
+"""Bounds of settings, and the bases of a method's own settings."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
@@ -15,7 +15,7 @@ Probability = Annotated[float, Field(ge=0, lt=1)]
 
 
 class Settings(BaseModel):
-    """Base of all settings: unknown keys are refused, nothing changes once made."""
+    """Base of all settings: unknown keys are refused, and instances are immutable."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
@@ -26,12 +26,37 @@ class MethodConfig(Settings):
     name: Any
     """The method."""
     standardise: bool = True
-    """Standardise observations by the statistics of the meta-training demonstrations."""
+    """Normalise observations by mean and standard deviation of the meta-training demonstrations."""
 
-    sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
-    """By size, paper, quick or smoke: what the method wants in place of the size's settings, by section."""
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    """Settings of the method's own, by section, in each of the presets paper, quick and smoke."""
     bound_of_shots: ClassVar[str | None] = None
-    """The setting that says to how many demonstrations the method can adapt, if there is such a bound."""
+    """Name of the setting that limits the demonstrations of a support set, if there is a limit."""
+
+
+class NetworkConfig(MethodConfig):
+    """Base of the settings of a method whose networks are perceptrons."""
+
+    hidden_layers: Size = 4
+    """Hidden layers of ReLU units in each network (F.2)."""
+    hidden_units: Size = 512
+    """Units in each hidden layer (F.2)."""
+    output_scale: Positive = 1.0
+    """Factor on the initial weights of the output layers, relative to He's initialisation."""
+
+    @property
+    def hidden(self) -> list[int]:
+        """Units of each hidden layer."""
+        return [self.hidden_units] * self.hidden_layers
+
+
+class WindowConfig(MethodConfig):
+    """Base of the settings of a method that draws {τ1}..{τ4} of Algorithm 1."""
+
+    trajectories: Size = 16
+    """Trajectories in each of τ1 to τ4 (Table 9)."""
+    window: Count | None = None
+    """Cut each trajectory to this many steps from a random step on; none uses it whole."""
 
 
 class HierarchicalConfig(MethodConfig):

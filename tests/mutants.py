@@ -29,8 +29,8 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
         "mass * (weighted - probabilities * weighted.sum(-1, keepdim=True))": "mass * (weighted)",
         "within = trajectory[1:] == trajectory[:-1]": "within = trajectory[1:] >= 0",
     },
-    ("dmil_core/slopes.py", "dmil_core/test_slopes.py"): {
-        "self.add_gradient(stepped, -learning_rate)": "self.add_gradient(stepped, -1.0)",
+    ("dmil_core/loss_gradients.py", "dmil_core/test_loss_gradients.py"): {
+        "self.add_to(stepped, -learning_rate)": "self.add_to(stepped, -1.0)",
         "weight.addmm_(deltas[index].mT, tangent[index - 1], alpha=-learning_rate)": "pass",
     },
     ("dmil_core/methods/dmil/meta_gradient.py", "dmil_core/methods/dmil/test_meta_gradient.py"): {
@@ -38,7 +38,9 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
         "choose(high, query_low.states)": "choose(path[0].adapted.high, query_low.states)",
     },
     ("dmil_core/methods/dmil/adaptation.py", "dmil_core/methods/dmil/test_adaptation.py"): {
-        "in_place=not keep and slope.network is not origin": "in_place=not keep",
+        "in_place=not keep and gradient.network is not origin": "in_place=not keep",
+    },
+    ("dmil_core/networks.py", "dmil_core/methods/dmil/test_adaptation.py"): {
         "[torch.cat(own).argsort()]": "[torch.cat(own)]",
     },
     ("dmil_core/outer_loop.py", "dmil_core/test_outer_loop.py"): {

@@ -5,13 +5,14 @@ from typing import Any
 
 from dmil_core.errors import UserError, shown
 from dmil_core.methods.base import Method
-from dmil_core.methods.behaviour_cloning.method import BehaviourCloning, PerTask
+from dmil_core.methods.behaviour_cloning.method import BehaviourCloning
 from dmil_core.methods.dmil.method import Dmil
 from dmil_core.methods.mil.method import Mil
 from dmil_core.methods.mlsh.method import Mlsh
 from dmil_core.methods.nearest_neighbour.method import NearestNeighbour
 from dmil_core.methods.option_gail.method import OptionGail, OptionGailOffline
 from dmil_core.methods.pemirl.method import Pemirl
+from dmil_core.methods.per_task.method import PerTask
 from dmil_core.settings import MethodConfig
 
 ENTRY_POINTS = "dmil.methods"

@@ -8,9 +8,9 @@ from typing import Any
 from pydantic import ValidationError
 
 from dmil_core.configs import (
+    BASE_PRESETS,
     DEFAULT_METHOD,
     PRESETS,
-    SIZES,
     EvaluationConfig,
     ExperimentConfig,
     SuiteConfig,
@@ -50,9 +50,9 @@ def config_from(
         UserError: names the key, what it got and what is allowed.
     """
     named, _, size = preset.rpartition("-")
-    if size not in SIZES or (named and preset not in PRESETS):
+    if size not in BASE_PRESETS or (named and preset not in PRESETS):
         raise UserError(
-            f"--preset: got {preset!r}; wanted {', '.join(SIZES)}, with --suite, or one of {', '.join(PRESETS)}"
+            f"--preset: got {preset!r}; wanted {', '.join(BASE_PRESETS)}, with --suite, or one of {', '.join(PRESETS)}"
         )
     given = {} if file is None else read_yaml(file, "--config")
     try:

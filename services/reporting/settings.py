@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from pydantic import BaseModel
 
-from dmil_core.configs import SIZES, ExperimentConfig, preset_of
+from dmil_core.configs import BASE_PRESETS, ExperimentConfig, preset_of
 from services.experiments.finished_run import FinishedRun
 from services.reporting.page import DataTable, Part, Prose, Section
 
@@ -25,7 +25,7 @@ def nearest_preset(config: ExperimentConfig) -> Nearest:
     """Return the preset of a run's own suite and method that is nearest to its settings."""
     own = _flat(config.model_dump())
     found = []
-    for size in SIZES:
+    for size in BASE_PRESETS:
         preset = _flat(preset_of(config.suite.name, size, config.method.name).model_dump())
         differing = {name: value for name, value in own.items() if name not in preset or preset[name] != value}
         found.append(Nearest(size, preset, differing))

@@ -10,9 +10,9 @@ import torch
 from torch.nn import functional
 
 from dmil_core.demonstrations import Demonstration
+from dmil_core.loss_gradients import LossGradient
 from dmil_core.losses import Steps
 from dmil_core.networks import Layer, Network, Parameters, initialise
-from dmil_core.slopes import Slope
 
 OBS_DIM, ACTION_DIM = 4, 3
 
@@ -77,12 +77,12 @@ def plain_mlp() -> Callable[[Network, torch.Tensor], torch.Tensor]:
 
 
 @pytest.fixture(scope="session")
-def gradient_of() -> Callable[[Slope], Network]:
-    """Have a slope add its gradient to nothing."""
+def gradient_of() -> Callable[[LossGradient], Network]:
+    """Have a gradient add its gradient to nothing."""
 
-    def gradient(slope: Slope) -> Network:
-        out = tuple(Layer(*map(torch.zeros_like, layer)) for layer in slope.network)
-        slope.add_gradient(out)
+    def gradient(gradient: LossGradient) -> Network:
+        out = tuple(Layer(*map(torch.zeros_like, layer)) for layer in gradient.network)
+        gradient.add_to(out)
         return out
 
     return gradient

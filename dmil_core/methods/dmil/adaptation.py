@@ -8,9 +8,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from dmil_core.loss_gradients import LossGradient, loss_gradient
 from dmil_core.losses import (
     Steps,
     Targets,
+    bank_errors,
     behaviour_cloning_loss,
     high_level_loss,
     soft_labels,
@@ -18,8 +20,7 @@ from dmil_core.losses import (
     sub_skill_labels,
 )
 from dmil_core.methods.dmil.config import DmilConfig
-from dmil_core.networks import Network, Parameters, bank, mlp, network, own_states, stacked
-from dmil_core.slopes import Slope, slope
+from dmil_core.networks import Network, Parameters, bank, mlp, network, own_states, routed, stacked, without_graph
 
 
 class Hierarchy(NamedTuple):
@@ -31,7 +32,7 @@ class Hierarchy(NamedTuple):
     @classmethod
     def of(cls, parameters: Parameters) -> "Hierarchy":
         """Return views of the high level (``high.*``) and of the bank of sub-skills (``low.*``), without graph."""
-        parameters = {name: tensor.detach() for name, tensor in parameters.items()}
+        parameters = without_graph(parameters)
         return cls(network(parameters, "high"), bank(parameters, "low"))
 
     @property
@@ -49,32 +50,15 @@ class Hierarchy(NamedTuple):
 class InnerStep(NamedTuple):
     """One step of the dual inner loop: what each level goes down, if it is adapted, and where they arrived."""
 
-    high: Slope
-    low: Mapping[int, Slope]
+    high: LossGradient
+    low: Mapping[int, LossGradient]
     """Of each sub-skill that was given any states."""
     adapted: Hierarchy
 
 
-class Adapted(NamedTuple):
-    """Adapted networks, and each level's loss before each inner step."""
-
-    hierarchy: Hierarchy
-    high_losses: tuple[float, ...]
-    low_losses: tuple[float, ...]
-
-
-def errors_of(low: Sequence[Network], steps: Steps) -> Float[Tensor, "sub_skills steps"]:
-    """Return ‖π_k(s_t) − a_t‖² of every sub-skill at every step."""
-    return torch.stack([_errors(sub_skill, steps) for sub_skill in low])
-
-
-def _errors(sub_skill: Network, steps: Steps) -> Float[Tensor, " steps"]:
-    return squared_errors(mlp(sub_skill, steps.states), steps.actions)
-
-
 def label(low: Sequence[Network], steps: Steps) -> Int[Tensor, " steps"]:
     """Return for each step the sub-skill that explains its action best, the target of equation 3."""
-    return sub_skill_labels(errors_of(low, steps))
+    return sub_skill_labels(bank_errors(low, steps))
 
 
 def targets_of(errors: Float[Tensor, "sub_skills steps"], config: DmilConfig, *, inner: bool) -> Targets:
@@ -94,27 +78,24 @@ def act(
 ) -> tuple[Float[Tensor, "steps action_dim"], Int[Tensor, " steps"]]:
     """Return for each state the action of the sub-skill that the high level takes, and which one that is."""
     chosen = choose(hierarchy.high, states)
-    first, *others = set(chosen.tolist()) or {0}  # no states are an answer too
-    if not others:
-        return mlp(hierarchy.low[first], states), chosen
-    own = own_states(chosen, len(hierarchy.low))
-    actions = [mlp(sub_skill, states[index]) for sub_skill, index in zip(hierarchy.low, own, strict=True) if len(index)]
-    return torch.cat(actions)[torch.cat(own).argsort()], chosen
+    return routed(hierarchy.low, states, chosen), chosen
 
 
-def high_level_slope(high: Network, steps: Steps, targets: Targets, config: DmilConfig) -> Slope:
+def high_level_gradient(high: Network, steps: Steps, targets: Targets, config: DmilConfig) -> LossGradient:
     """Return L_h of the high level on `steps` (equation 3 with Appendix C's term)."""
     weight, continuity = config.continuity_weight, config.continuity
-    return slope(high, steps.states, lambda logits: high_level_loss(logits, targets, steps.lengths, weight, continuity))
+    return loss_gradient(
+        high, steps.states, lambda logits: high_level_loss(logits, targets, steps.lengths, weight, continuity)
+    )
 
 
-def sub_skill_slopes(low: Sequence[Network], steps: Steps, chosen: Int[Tensor, " steps"]) -> dict[int, Slope]:
+def sub_skill_gradients(low: Sequence[Network], steps: Steps, chosen: Int[Tensor, " steps"]) -> dict[int, LossGradient]:
     """Return L_BC of each sub-skill on the states that the high level gave it, where there are any (equation 4)."""
     own = own_states(chosen, len(low))
 
-    def of(k: int) -> Slope:
+    def of(k: int) -> LossGradient:
         actions = steps.actions[own[k]]
-        return slope(low[k], steps.states[own[k]], lambda p: behaviour_cloning_loss(p, actions))
+        return loss_gradient(low[k], steps.states[own[k]], lambda p: behaviour_cloning_loss(p, actions))
 
     return {k: of(k) for k in range(len(low)) if len(own[k])}
 
@@ -127,7 +108,7 @@ def inner_loop(
     *,
     keep: bool = False,
 ) -> Iterator[InnerStep]:
-    """Go down both levels' losses in turn, step after step without end (Algorithm 1); `hierarchy` stays as it is.
+    """Yield the steps of the dual inner loop, without end (Algorithm 1); `hierarchy` stays unchanged.
 
     Args:
         hierarchy: where to start.
@@ -135,24 +116,29 @@ def inner_loop(
         support_low: τ2, which adapts each sub-skill on the states that the high level gives it by then. At test both
             are the support set.
         config: α, which levels are adapted, and to what; the other level stays as it is.
-        keep: keep each step's networks as they were, for `Slope.pull_back`; else the next step overwrites them.
+        keep: leave each step's networks unchanged, for `LossGradient.jacobian_product`; else the next step overwrites
+            them.
     """
     high, low = hierarchy
 
-    def descend(slope: Slope, origin: Network) -> Network:
-        return slope.descend(config.inner_learning_rate, in_place=not keep and slope.network is not origin)
+    def descend(gradient: LossGradient, origin: Network) -> Network:
+        return gradient.descend(config.inner_learning_rate, in_place=not keep and gradient.network is not origin)
 
-    errors = [_errors(sub_skill, support_high) for sub_skill in low]
+    def errors_of(sub_skill: Network) -> Float[Tensor, " steps"]:
+        return squared_errors(mlp(sub_skill, support_high.states), support_high.actions)
+
+    errors = [errors_of(sub_skill) for sub_skill in low]
     while True:
-        of_high = high_level_slope(high, support_high, targets_of(torch.stack(errors), config, inner=True), config)
+        of_high = high_level_gradient(high, support_high, targets_of(torch.stack(errors), config, inner=True), config)
         if config.adapted != "low":
             high = descend(of_high, hierarchy.high)
-        of_low = sub_skill_slopes(low, support_low, choose(high, support_low.states))
+        of_low = sub_skill_gradients(low, support_low, choose(high, support_low.states))
         if config.adapted != "high":
             low = tuple(descend(of_low[k], hierarchy.low[k]) if k in of_low else low[k] for k in range(len(low)))
         yield InnerStep(of_high, of_low, Hierarchy(high, low))
         if config.adapted != "high":  # a sub-skill that was given no states is still the same
-            errors = [_errors(low[k], support_high) if k in of_low else errors[k] for k in range(len(low))]
+            for k in of_low:
+                errors[k] = errors_of(low[k])
 
 
 def adapt(
@@ -162,11 +148,8 @@ def adapt(
     config: DmilConfig,
     *,
     steps: int,
-) -> Adapted:
-    """Run so many steps of the `inner_loop`."""
-    high_losses, low_losses = [], []
+) -> Hierarchy:
+    """Return the networks after `steps` steps of the `inner_loop`."""
     for step in itertools.islice(inner_loop(hierarchy, support_high, support_low, config), steps):
         hierarchy = step.adapted
-        high_losses.append(step.high.loss.value.item())
-        low_losses.append(sum(of_low.loss.value.item() for of_low in step.low.values()))
-    return Adapted(hierarchy, tuple(high_losses), tuple(low_losses))
+    return hierarchy

@@ -3,45 +3,35 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from dmil_core.settings import Count, HierarchicalConfig, NotNegative, Positive, Size
+from dmil_core.settings import HierarchicalConfig, NetworkConfig, NotNegative, Positive, Size, WindowConfig
 
 
-class DmilConfig(HierarchicalConfig):
+class DmilConfig(HierarchicalConfig, NetworkConfig, WindowConfig):
     """Dual Meta Imitation Learning."""
 
     name: Literal["dmil"] = "dmil"
     """The method."""
-    hidden_layers: Size = 4
-    """Layers of ReLU units in each network (F.2)."""
-    hidden_units: Size = 512
-    """Units in each hidden layer (F.2)."""
-    output_scale: Positive = 1.0
-    """Scale of the output layers' first weights, against He's; the paper names no initialisation."""
     inner_learning_rate: Positive = 5e-4
-    """α (Table 9)."""
+    """Learning rate α of the inner loop (Table 9)."""
     inner_steps: Size = 3
     """Steps of the inner loop, Table 9's fine-tune iterations."""
     continuity_weight: NotNegative = 0.1
-    """λ (Table 9; Appendix C says 1)."""
+    """Weight λ of the continuity loss (Table 9; Appendix C has 1)."""
     adapted: Literal["both", "high", "low"] = "both"
-    """Levels with an inner loop, which are also the ones adapted at test: both; high is DMIL-High and low is DMIL-Low,
-    where the outer loop trains the other level as it is (F.3)."""
+    """Levels that the inner loop adapts, in meta-training and at test: high is DMIL-High and low is DMIL-Low, where the
+    other level learns in the outer loop alone (F.3)."""
     em: Literal["hard", "soft", "reference_soft"] = "hard"
-    """What the high level learns to predict: the best-fitting sub-skill (equation 3); soft is DMIL_soft (E.6), the
-    posterior softmax(-|a - pi_k(s)|^2 / 2 sigma^2); reference_soft: that of the authors' released code."""
+    """Targets of the high level: hard is the best-fitting sub-skill (equation 3); soft is DMIL_soft (E.6), the
+    posterior softmax(-|a - pi_k(s)|^2 / 2 sigma^2); reference_soft is that of the authors' released code."""
     posterior_deviation: Positive = 0.5**0.5
-    """σ of the posterior; the paper names none: this one makes it the softmax of the negative squared errors."""
+    """Standard deviation σ of the posterior; the default makes it the softmax of the negative squared errors."""
     continuity: Literal["expected", "reference"] = "expected"
-    """The continuity loss: the expected switches, which have a gradient; or, as in the authors' released code, the
-    count of equation 15, which has none and so only adds to the loss that is shown."""
+    """Continuity loss: expected is the expected number of switches; reference is the count of equation 15, as in the
+    authors' released code, which has no gradient."""
     order: Literal["first", "second"] = "second"
-    """Of the meta-gradient: exact, or taken at the adapted parameters."""
-    trajectories: Size = 16
-    """Trajectories in each of τ1 to τ4 (Table 9)."""
-    window: Count | None = None
-    """Cut each trajectory to so many steps at a random place; none takes it whole."""
+    """Order of the meta-gradient: second is exact, first is taken at the adapted parameters."""
 
-    sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "quick": {
             "method": {
                 "hidden_layers": 3,

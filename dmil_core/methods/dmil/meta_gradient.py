@@ -5,20 +5,19 @@ from collections.abc import Mapping
 
 import torch
 
-from dmil_core.losses import Steps, continuity_loss, sub_skill_labels
+from dmil_core.loss_gradients import LossGradient
+from dmil_core.losses import Steps, bank_errors, continuity_loss, sub_skill_labels
 from dmil_core.methods.base import TaskGradient
 from dmil_core.methods.dmil.adaptation import (
     Hierarchy,
     choose,
-    errors_of,
-    high_level_slope,
+    high_level_gradient,
     inner_loop,
-    sub_skill_slopes,
+    sub_skill_gradients,
     targets_of,
 )
 from dmil_core.methods.dmil.config import DmilConfig
-from dmil_core.networks import Parameters, unflatten
-from dmil_core.slopes import Slope
+from dmil_core.networks import Parameters, zeros_like
 
 
 def task_gradient(
@@ -41,23 +40,23 @@ def task_gradient(
     path = list(itertools.islice(loop, config.inner_steps))
     high, low = path[-1].adapted
 
-    errors = errors_of(low, query_high)
-    of_high = high_level_slope(high, query_high, targets_of(errors, config, inner=False), config)
+    errors = bank_errors(low, query_high)
+    of_high = high_level_gradient(high, query_high, targets_of(errors, config, inner=False), config)
     chosen = choose(high, query_low.states)
-    of_low = sub_skill_slopes(low, query_low, chosen)
+    of_low = sub_skill_gradients(low, query_low, chosen)
 
-    gradient = torch.zeros(sum(tensor.numel() for tensor in parameters.values()), dtype=query_high.states.dtype)
-    vector = Hierarchy.of(unflatten(gradient, {name: tensor.shape for name, tensor in parameters.items()}))
-    of_high.add_gradient(vector.high)
+    gradient, views = zeros_like(parameters)
+    vector = Hierarchy.of(views)
+    of_high.add_to(vector.high)
     for k, outer in of_low.items():
-        outer.add_gradient(vector.low[k])
+        outer.add_to(vector.low[k])
     if second:
         for step in reversed(path):
             if config.adapted != "low":
-                step.high.pull_back(vector.high, rate)
+                step.high.jacobian_product(vector.high, rate)
             if config.adapted != "high":
                 for k in step.low.keys() & of_low.keys():
-                    step.low[k].pull_back(vector.low[k], rate)
+                    step.low[k].jacobian_product(vector.low[k], rate)
 
     probabilities = of_high.outputs.softmax(-1)
     shares = torch.bincount(chosen, minlength=config.sub_skills) / len(chosen)
@@ -75,6 +74,6 @@ def task_gradient(
     return TaskGradient(gradient, metrics)
 
 
-def _total(slopes: Mapping[int, Slope]) -> float:
+def _total(gradients: Mapping[int, LossGradient]) -> float:
     """Return Σ_k L_BC."""
-    return sum(of_sub_skill.loss.value.item() for of_sub_skill in slopes.values())
+    return sum(of_sub_skill.loss.value.item() for of_sub_skill in gradients.values())

@@ -18,32 +18,32 @@ class MilConfig(MethodConfig):
     units: Size = 512
     """Units of each token, d_model (Table 10)."""
     key_units: Size = 64
-    """Of each head's keys and queries, d_k (Table 10)."""
+    """Units of each head's keys and queries, d_k (Table 10)."""
     value_units: Size = 64
-    """Of each head's values, d_v (Table 10)."""
+    """Units of each head's values, d_v (Table 10)."""
     feed_forward_units: Size = 2048
-    """Hidden units of each layer; the paper names none."""
+    """Hidden units of each layer's feed-forward part; the paper gives no number."""
     output_scale: Positive = 0.1
-    """Scale of the output layer's first weights, against those of all others: at 1 the first inner steps overshoot."""
+    """Factor on the initial weights of the output layer: at 1 the first inner steps overshoot."""
     positions: Size = 250
-    """Places in a demonstration (Table 10); a longer one is thinned out to so many steps."""
+    """Positions in a demonstration (Table 10); a longer one is thinned out to this many steps."""
     dropout: Probability = 0.1
-    """In the outer loss (Table 10)."""
+    """Dropout rate in the outer loss (Table 10)."""
     batch_pairs: Size = 512
-    """State-action pairs that each of the two losses asks for at most (Table 10)."""
+    """Largest number of state-action pairs in each of the two losses (Table 10)."""
     shots: Size = 3
-    """Most demonstrations in a support set: meta-training draws from one to so many."""
+    """Largest number of demonstrations in a support set: meta-training draws from one to this many."""
     inner_learning_rate: Positive = 1e-3
-    """α; the paper names none, Finn et al. 2017 have 0.001 to 0.01."""
+    """Learning rate α of the inner loop; Finn et al. 2017 have 0.001 to 0.01."""
     inner_steps: Size = 1
     """Steps of the inner loop (Finn et al. 2017)."""
     inner_clip: Positive | None = 10.0
-    """Clip each number of the inner gradients to ± this (Finn et al. 2017: 10 or 20)."""
+    """Clip each element of the inner gradients to ± this value (Finn et al. 2017: 10 or 20)."""
     order: Literal["first", "second"] = "second"
-    """Of the meta-gradient: exact, or taken at the adapted parameters."""
+    """Order of the meta-gradient: second is exact, first is taken at the adapted parameters."""
 
     bound_of_shots: ClassVar[str | None] = "shots"
-    sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "paper": {"evaluation": {"fine_tuning_steps": 1, "learning_rate": 1e-3}},
         "quick": {
             "method": {

@@ -13,7 +13,7 @@ from dmil_core.losses import squared_errors
 from dmil_core.methods.base import FineTuning, TaskGradient
 from dmil_core.methods.mil.config import MilConfig
 from dmil_core.methods.mil.transformer import Dropout, cached, decode, dropout, encode, no_dropout, position_encoding
-from dmil_core.networks import Parameters, flatten
+from dmil_core.networks import Parameters, flatten, leaves
 
 
 class Pairs(NamedTuple):
@@ -112,7 +112,7 @@ def adapted(parameters: Parameters, support: Support, config: MilConfig, tuning:
     fast, first, clipped = dict(parameters), None, 0
     for _ in range(tuning.steps):
         if not keep:
-            fast = _leaves(fast)
+            fast = leaves(fast)
         with torch.enable_grad():
             loss = inner_loss(fast, support, config)
             gradients = torch.autograd.grad(loss, tuple(fast.values()), create_graph=keep)
@@ -126,7 +126,7 @@ def adapted(parameters: Parameters, support: Support, config: MilConfig, tuning:
             }
         first = loss.item() if first is None else first
     numbers = max(1, tuning.steps * sum(tensor.numel() for tensor in parameters.values()))
-    return Adapted(fast if keep else _leaves(fast), first, clipped / numbers)
+    return Adapted(fast if keep else leaves(fast), first, clipped / numbers)
 
 
 def outer_gradient(
@@ -136,7 +136,7 @@ def outer_gradient(
 
     The metrics tell the outer loss with and without the inner loop, under the same dropout.
     """
-    start = _leaves(parameters)
+    start = leaves(parameters)
     second = config.order == "second"
     tuning = FineTuning(config.inner_steps, config.inner_learning_rate)
     end = adapted(start, support, config, tuning, keep=second)
@@ -162,11 +162,6 @@ def _predictions(
     """Return f_θ(s | D) at some states."""
     encoded = encode(parameters, *context, config.heads, drop)
     return decode(parameters, states, cached(parameters, encoded, config.heads), drop)
-
-
-def _leaves(parameters: Parameters) -> dict[str, Tensor]:
-    """Return the same numbers, cut off from what they came from, ready to be differentiated by."""
-    return {name: tensor.detach().requires_grad_() for name, tensor in parameters.items()}
 
 
 def _evenly(count: int, most: int) -> Int64[np.ndarray, " kept"]:

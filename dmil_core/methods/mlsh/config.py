@@ -3,48 +3,50 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from dmil_core.settings import Count, HierarchicalConfig, NotNegative, Positive, Probability, Size
+from dmil_core.settings import (
+    Count,
+    HierarchicalConfig,
+    NetworkConfig,
+    NotNegative,
+    Positive,
+    Probability,
+    Size,
+)
 
 
-class MlshConfig(HierarchicalConfig):
+class MlshConfig(HierarchicalConfig, NetworkConfig):
     """Meta Learning Shared Hierarchies, behaviour-cloning variant."""
 
     name: Literal["mlsh"] = "mlsh"
     """The method."""
-    hidden_layers: Size = 4
-    """Layers of ReLU units in each network, as DMIL's (F.2)."""
-    hidden_units: Size = 512
-    """Units in each hidden layer (F.2)."""
-    output_scale: Positive = 1.0
-    """Scale of the sub-skills' first output weights, against He's."""
     macro_step: Size = 3
-    """Steps that a sub-skill acts before the high level picks anew (F.2)."""
+    """Steps that a sub-skill acts before the high level chooses again (F.2)."""
     high_learning_rate: Positive = 1e-3
-    """Of the high level's Adam (Table 11)."""
+    """Learning rate of the high level's Adam (Table 11)."""
     sub_skill_learning_rate: Positive = 1e-4
-    """Of the sub-skills' Adam (Table 11)."""
+    """Learning rate of the sub-skills' Adam (Table 11)."""
     clip: Positive = 0.02
-    """ε, how far PPO's ratio may go from 1 (Table 11)."""
+    """Clip range ε of PPO's probability ratio (Table 11)."""
     warm_up_updates: Count = 500
     """Updates of the fresh high level alone (Table 11)."""
     joint_updates: Count = 1000
-    """Updates of both levels after that (Table 11)."""
+    """Updates of both levels after the warm-up (Table 11)."""
     batch_size: Size = 900
     """State-action pairs in a batch (Table 11)."""
     passes: Size = 3
     """Updates from one batch."""
     deviation: Positive = 0.3
-    """σ of the sub-skills' actions in training."""
+    """Standard deviation σ of the sub-skills' actions in training."""
     discount: Probability = 0.0
-    """γ."""
+    """Discount γ."""
     trace: Probability = 0.98
-    """λ of generalised advantages; without effect where γ = 0."""
+    """λ of generalised advantage estimation; without effect where γ = 0."""
     value_weight: NotNegative = 0.5
-    """c, the weight of the values' squared error."""
+    """Weight c of the values' squared error."""
     trajectories: Size = 64
-    """Demonstrations that a sampled task contributes, as many as DMIL's four sets; where there are fewer, all."""
+    """Demonstrations of a sampled task, as many as DMIL's four sets; all of them where there are fewer."""
 
-    sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "paper": {
             "training": {"outer_step": "average", "learning_rate": 1.0},
             "evaluation": {"fine_tuning_steps": 500, "learning_rate": 1e-3},

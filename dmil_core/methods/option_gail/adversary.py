@@ -19,7 +19,7 @@ from dmil_core.methods.base import Rollout
 from dmil_core.methods.option_gail.config import OptionGailConfig
 from dmil_core.methods.option_gail.option_model import OptionModel, options_before
 from dmil_core.methods.ppo import clipped_surrogate, generalised_advantages
-from dmil_core.networks import Parameters, mlp, network
+from dmil_core.networks import Parameters, descend, mlp, network
 
 POLICY = ("high.", "low.", "log_deviations")
 """What the names of the option model's parameters begin with."""
@@ -98,9 +98,7 @@ def discriminate(
         of_policy, of_expert = (discriminator_logits(moved, side, k) for side in (played.at(index), expert.at(others)))
         loss = discriminator_loss(of_policy, of_expert)
         losses.append(loss.item())
-        descent.zero_grad()
-        loss.backward()
-        descent.step()
+        descend(descent, loss)
     with torch.no_grad():
         caught = (discriminator_logits(moved, played, k) > 0).float().mean().item()
         believed = (discriminator_logits(moved, expert, k) < 0).float().mean().item()
@@ -209,9 +207,7 @@ def improve(
         high = clipped_surrogate(new.high - old.high[index], aims.high[index], config.clip)
         low = clipped_surrogate(new.low - old.low[index], aims.low[index], config.clip)
         errors = low_values(moved, some) - aims.returns[index]
-        descent.zero_grad()
-        (errors.square().mean() / 2 - high - low - config.option_entropy * new.entropy).backward()
-        descent.step()
+        descend(descent, errors.square().mean() / 2 - high - low - config.option_entropy * new.entropy)
     with torch.no_grad():
         new, errors = decisions(moved, played, config), low_values(moved, played) - aims.returns
         return {

@@ -5,26 +5,28 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from dmil_core.settings import Count, HierarchicalConfig, NotNegative, Positive, Probability, Size
+from dmil_core.settings import (
+    Count,
+    HierarchicalConfig,
+    NetworkConfig,
+    NotNegative,
+    Positive,
+    Probability,
+    Size,
+)
 
 Iterations = Annotated[int, Field(ge=0, le=10**9)]
 
 
-class OptionConfig(HierarchicalConfig):
+class OptionConfig(HierarchicalConfig, NetworkConfig):
     """Base of both: the option model and its maximum likelihood."""
 
-    hidden_layers: Size = 4
-    """Layers of ReLU units of π_H and of each option, as in DMIL (F.2); the original has 2."""
-    hidden_units: Size = 512
-    """Units in each hidden layer, as in DMIL (F.2); the original has 64."""
-    output_scale: Positive = 1.0
-    """Scale of the output layers' first weights, against He's."""
     least_log_deviation: Annotated[float, Field(le=0, allow_inf_nan=False)] = -20.0
-    """Lower bound of log σ of an option's actions; the upper one is 0."""
+    """Lower bound of log σ of an option's actions; the upper bound is 0."""
     trajectories: Size = 16
-    """Whole demonstrations of a slot's task that it learns from (Table 9)."""
+    """Whole demonstrations that a slot draws from its task (Table 9)."""
     likelihood_iterations: Iterations = 250
-    """So many iterations go up the likelihood, before those of hard EM."""
+    """Iterations of maximum likelihood, before those of hard EM."""
 
 
 class OptionGailOfflineConfig(OptionConfig):
@@ -33,7 +35,7 @@ class OptionGailOfflineConfig(OptionConfig):
     name: Literal["option-gail-offline"] = "option-gail-offline"
     """The method."""
 
-    sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "paper": {"evaluation": {"learning_rate": 3e-4}},
         "quick": {
             "method": {
@@ -58,39 +60,39 @@ class OptionGailConfig(OptionConfig):
     name: Literal["option-gail"] = "option-gail"
     """The method."""
     likelihood_iterations: Iterations = 60
-    """So many iterations go up the likelihood, before the other offline ones, which are of hard EM."""
+    """Offline iterations of maximum likelihood; the remaining ones are of hard EM."""
     offline_iterations: Iterations = 400
-    """Iterations before the adversarial ones."""
+    """Offline iterations, before the adversarial ones."""
     offline_steps: Count = 10
-    """A slot's own steps of Adam in an offline iteration, each on all that it drew."""
+    """Steps of Adam that a slot takes in an offline iteration, each on its whole batch."""
     offline_learning_rate: Positive = 1e-3
-    """Of a slot's own Adam in an offline iteration: log σ goes down by no more than this in a step."""
+    """Learning rate of a slot's Adam in an offline iteration, and so the largest change of log σ in a step."""
     environment_steps: Count = 410
-    """A slot's steps in its task's environments in an adversarial iteration: 10 slots have the original's 4,096."""
+    """Environment steps of a slot in an adversarial iteration: 10 slots have the original's 4,096."""
     learning_rate: Positive = 3e-4
-    """Of a slot's own Adam in an adversarial iteration."""
+    """Learning rate of a slot's Adam in an adversarial iteration."""
     weight_decay: NotNegative = 1e-3
-    """Of the same."""
+    """Weight decay of a slot's Adam in an adversarial iteration."""
     minibatch: Size = 64
-    """Steps in one step of the discriminator, from either side, and of PPO."""
+    """Minibatch size of PPO, and of the policy's and the expert's side of the discriminator."""
     discriminator_passes: Count = 10
-    """Passes of the discriminator over the policy's steps in a round."""
+    """Epochs of the discriminator over the policy's steps in an adversarial iteration."""
     policy_epochs: Count = 10
-    """Passes of PPO over the same."""
+    """Epochs of PPO over the policy's steps in an adversarial iteration."""
     discount: Probability = 0.99
-    """γ."""
+    """Discount γ."""
     smoothing: Annotated[float, Field(ge=0, le=1)] = 0.95
-    """λ of generalised advantages."""
+    """λ of generalised advantage estimation."""
     clip: Positive = 0.2
-    """ε of PPO's clipped surrogate, of both levels."""
+    """Clip range ε of PPO's probability ratio at both levels."""
     option_entropy: NotNegative = 1e-2
-    """Weight of π_H's entropy."""
+    """Weight of the entropy of π_H."""
     discriminator_units: Size = 256
     """Units in either hidden layer of the discriminator."""
     critic_units: Size = 64
     """Units in either hidden layer of the critic."""
 
-    sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "paper": {
             "training": {"iterations": 4400, "outer_step": "average", "learning_rate": 1.0},
             "evaluation": {"learning_rate": 3e-4},

@@ -1,38 +1,4 @@
-"""OptionGAIL (Jing et al. 2021, "Adversarial option-aware hierarchical imitation learning"), and its half without play.
-
-Both learn one option model of all meta-training tasks together (`options`); there is no meta-learning, and at test a
-few epochs on the support set (F.3). Networks are DMIL's in layers and units, for a fair comparison; the original has
-64x64. With J = Σ_t log π_H(o_t | s_t, o_{t−1}) + log π_L(a_t | s_t, o_t):
-
-- ``option-gail-offline`` goes up the likelihood, log Σ_o exp J, by its exact gradient (forward-backward), so that the
-  options part while none is sure; then it is hard EM: o* = argmax_o J by Viterbi, and up J at o*. It is named as what
-  it is: not adversarial, and without a simulator.
-- ``option-gail`` begins in the same way, and goes on as the original, in the environments of meta-training tasks:
-  1. relabel: o* by Viterbi for the demonstrations;
-  2. discriminate: d(s, a, o', o), one of (K + 1)·K outputs on (s, a), goes down the binary cross-entropy of the
-     policy's steps, which are 1, and the demonstrations', which are 0;
-  3. improve: PPO (Schulman et al. 2017) on the rewards −log σ(d), which both levels share.
-
-What the sources leave open, and what is chosen here:
-
-- *Levels.* As in DAC (Zhang & Whiteson 2019), the two levels are two decision processes on one trajectory: the high
-  one decides in (s_t, o_{t−1}), the low one in (s_t, o_t). A critic gives V_L(s, o); V_H(s, o') = Σ_o π_H(o|s,o') V_L.
-  Each level has advantages of its own (`ppo`, which says why they are not RLlib's), standardised per round.
-- *Ends.* The reward is positive everywhere, so an episode cut off at its success would be worth less than one that
-  never succeeds. Ends come from the protocol and not from the task: every episode is valued by V_H beyond its end.
-- *Centre.* Rewards are taken less their mean over the round. As every episode goes on beyond its end, that changes no
-  true advantage, and it keeps values near 0, where the critic starts.
-- *Weight decay* is decoupled (Loshchilov & Hutter 2019): with moments that start at 0, an L2 term would move a weight
-  of little gradient at the full rate.
-- *Slots.* The original's epoch of 4,096 steps is an iteration here, its steps split over the tasks of its slots. A
-  slot takes its own steps of Adam from where the iteration starts and returns the way, parameters before minus after;
-  the outer step goes to the slots' mean (``outer_step: average``), as in federated averaging (McMahan et al. 2017).
-  Adam's moments start at 0 in each slot. The offline iterations are run in the same way.
-- *Pre-training.* How the appendix's authors pre-trained is not said; the original's 16 million steps are in the size
-  ``paper``, at most half a million of them in ``quick``.
-- *Test.* So many epochs of hard EM on the support set, each one step of Adam on all of it with fresh Viterbi labels.
-  The discriminator and the critic rest: meta-testing tasks are not acted in before they are judged.
-"""
+"""OptionGAIL and its offline half as methods: what they draw, their gradients and their adaptation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -67,7 +33,7 @@ from dmil_core.methods.option_gail.option_model import (
     weighted_log_likelihood,
 )
 from dmil_core.methods.option_gail.policy import OptionExplorationPolicy, OptionPolicy
-from dmil_core.networks import Parameters, flatten, initialise
+from dmil_core.networks import Parameters, descend, flatten, initialise, leaves, without_graph
 
 Phase = Literal["likelihood", "hard", "adversarial"]
 
@@ -88,11 +54,6 @@ class OptionBatch:
         return tuple(demonstration.id for demonstration in self.demonstrations)
 
 
-def _copied(parameters: Parameters) -> dict[str, Tensor]:
-    """Return a copy to descend in place."""
-    return {name: tensor.detach().clone().requires_grad_() for name, tensor in parameters.items()}
-
-
 class _Imitated(NamedTuple):
     loss: Float[Tensor, ""]
     """To differentiate: its value is the negative log-likelihood for hard EM only."""
@@ -105,8 +66,7 @@ class _Options(MetaLearner[Any, OptionBatch]):
 
     def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the option model: σ = 1."""
-        hidden = [self.config.hidden_units] * self.config.hidden_layers
-        k, scale = self.config.sub_skills, self.config.output_scale
+        hidden, k, scale = self.config.hidden, self.config.sub_skills, self.config.output_scale
         return {
             **initialise("high", [self.obs_dim, *hidden, (k + 1) * k], rng, output_scale=scale),
             **initialise("low", [self.obs_dim, *hidden, self.action_dim], rng, copies=k, output_scale=scale),
@@ -116,12 +76,12 @@ class _Options(MetaLearner[Any, OptionBatch]):
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> OptionPolicy:
         """Take steps of Adam up the complete-data log-likelihood of the support set, relabelled before each."""
         policy = {name: tensor for name, tensor in parameters.items() if name.startswith(POLICY)}
-        adapted = _copied(policy)
+        adapted = leaves(policy, copy=True)
         descent = torch.optim.Adam(adapted.values(), lr=fine_tuning.learning_rate, fused=True)
         steps = Steps.of(support, self.normalise)
         for _ in range(fine_tuning.steps):
-            _step(descent, self._imitate(adapted, steps, "hard").loss)
-        return OptionPolicy(self._model({name: tensor.detach() for name, tensor in adapted.items()}), self.normalise)
+            descend(descent, self._imitate(adapted, steps, "hard").loss)
+        return OptionPolicy(self._model(without_graph(adapted)), self.normalise)
 
     def _model(self, parameters: Parameters) -> OptionModel:
         return OptionModel.of(parameters, self.config.least_log_deviation)
@@ -153,13 +113,6 @@ class _Options(MetaLearner[Any, OptionBatch]):
         return _Imitated(loss, metrics, pairs)
 
 
-def _step(descent: torch.optim.Optimizer, loss: Float[Tensor, ""]) -> None:
-    """Take one step down a loss."""
-    descent.zero_grad()
-    loss.backward()
-    descent.step()
-
-
 class OptionGailOffline(_Options):
     """Maximum likelihood, then hard EM, for observations and actions of given sizes."""
 
@@ -172,10 +125,10 @@ class OptionGailOffline(_Options):
 
     def task_gradient(self, parameters: Parameters, batch: OptionBatch) -> TaskGradient:
         """Return the gradient of −log p per step: of the actions, or of the actions and Viterbi's labels."""
-        leaves = {name: tensor.detach().requires_grad_() for name, tensor in parameters.items()}
-        imitated = self._imitate(leaves, Steps.of(batch.demonstrations, self.normalise), batch.phase)
-        gradients = torch.autograd.grad(imitated.loss, list(leaves.values()))
-        return TaskGradient(flatten(dict(zip(leaves, gradients, strict=True))), imitated.metrics)
+        free = leaves(parameters)
+        imitated = self._imitate(free, Steps.of(batch.demonstrations, self.normalise), batch.phase)
+        gradients = torch.autograd.grad(imitated.loss, list(free.values()))
+        return TaskGradient(flatten(dict(zip(free, gradients, strict=True))), imitated.metrics)
 
 
 class OptionGail(_Options, OnlineMetaLearner[Any, OptionBatch]):
@@ -205,7 +158,7 @@ class OptionGail(_Options, OnlineMetaLearner[Any, OptionBatch]):
 
     def exploration_policy(self, parameters: Parameters, batch: OptionBatch) -> OptionExplorationPolicy:
         """Return the option model, which acts at random."""
-        model = self._model({name: tensor.detach() for name, tensor in parameters.items()})
+        model = self._model(without_graph(parameters))
         return OptionExplorationPolicy(model, self.normalise, batch.seed)
 
     def with_rollouts(self, batch: OptionBatch, rollouts: Sequence[Rollout]) -> OptionBatch:
@@ -214,7 +167,7 @@ class OptionGail(_Options, OnlineMetaLearner[Any, OptionBatch]):
 
     def task_gradient(self, parameters: Parameters, batch: OptionBatch) -> TaskGradient:
         """Return the way that the slot's own steps of Adam went, before minus after."""
-        moved = _copied(parameters)
+        moved = leaves(parameters, copy=True)
         demonstrated = Steps.of(batch.demonstrations, self.normalise)
         if batch.phase == "adversarial":
             metrics = self._play_round(moved, demonstrated, batch)
@@ -230,7 +183,7 @@ class OptionGail(_Options, OnlineMetaLearner[Any, OptionBatch]):
         for _ in range(self.config.offline_steps):
             imitated = self._imitate(moved, demonstrated, phase)
             metrics.append(imitated.metrics)
-            _step(descent, imitated.loss)
+            descend(descent, imitated.loss)
         return metrics[0]
 
     def _play_round(self, moved: dict[str, Tensor], demonstrated: Steps, batch: OptionBatch) -> dict[str, float]:

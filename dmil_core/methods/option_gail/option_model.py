@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from dmil_core.networks import Network, Parameters, bank, mlp, network, own_states
+from dmil_core.networks import Network, Parameters, bank, mlp, network, routed
 
 LARGEST_LOG_DEVIATION = 0.0
 """Of the original, as its least: −20."""
@@ -70,11 +70,7 @@ class OptionModel(NamedTuple):
         self, states: Float[Tensor, "steps obs_dim"], options: Int[Tensor, " steps"]
     ) -> Float[Tensor, "steps action_dim"]:
         """Return μ_o(s_t) for one given option at each step."""
-        own = own_states(options, self.options)
-        outputs = [mlp(sub_skill, states[index]) for sub_skill, index in zip(self.low, own, strict=True) if len(index)]
-        if not outputs:
-            return states.new_zeros(0, self.log_deviations.shape[-1])
-        return torch.cat(outputs)[torch.cat(own).argsort()]
+        return routed(self.low, states, options)
 
 
 def _log_density(errors: Float[Tensor, "*batch action_dim"], log_deviations: Tensor) -> Float[Tensor, "*batch"]:
@@ -136,14 +132,6 @@ def _backward(chain: Chain) -> Float[Tensor, "time trajectories options"]:
     for link in chain.links.flip(0):
         betas.append((link + betas[-1][:, None]).logsumexp(2))
     return torch.stack(betas[::-1])
-
-
-def log_likelihood(chain: Chain) -> Float[Tensor, " trajectories"]:
-    """Return log p(a_0.. | s_0..), the sum over all options, by the forward algorithm: Σ_o α_T(o) at the last step.
-
-    The original's code weights every prefix; the likelihood is that of the whole.
-    """
-    return _forward(chain)[-1].logsumexp(-1)
 
 
 @torch.no_grad()

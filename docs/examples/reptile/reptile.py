@@ -12,7 +12,7 @@ import torch
 from dmil_core.demonstrations import Demonstration
 from dmil_core.losses import Steps
 from dmil_core.methods.base import FineTuning, MetaLearner, TaskGradient
-from dmil_core.methods.behaviour_cloning.method import NetworkPolicy, fine_tuned
+from dmil_core.methods.behaviour_cloning.policy import NetworkPolicy, fine_tuned
 from dmil_core.networks import Network, Parameters, flatten, initialise, mlp, network
 from dmil_core.settings import Count, MethodConfig, Positive, Size
 
@@ -31,7 +31,7 @@ class ReptileConfig(MethodConfig):
     inner_learning_rate: Positive = 0.02
     """Of these steps."""
 
-    sizes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "paper": {"training": {"outer_step": "average", "learning_rate": 0.5}},
         "quick": {"training": {"outer_step": "average", "learning_rate": 0.5, "gradient_clip": None}},
         "smoke": {"training": {"outer_step": "average", "learning_rate": 0.5}, "method": {"hidden_units": 32}},

@@ -8,12 +8,8 @@ from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import Rollout
 from dmil_core.methods.mil.config import MilConfig
 from dmil_core.methods.mlsh.config import MlshConfig
-from dmil_core.methods.option_gail.method import (
-    OptionGail,
-    OptionGailConfig,
-    OptionGailOffline,
-    OptionGailOfflineConfig,
-)
+from dmil_core.methods.option_gail.config import OptionGailConfig, OptionGailOfflineConfig
+from dmil_core.methods.option_gail.method import OptionGail, OptionGailOffline
 from dmil_core.methods.option_gail.option_model import OptionModel
 from dmil_core.networks import Parameters
 from dmil_core.seeding import named_rng

@@ -12,8 +12,12 @@ from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.losses import Steps
 from dmil_core.methods.base import FineTuning, MetaLearner, Policy
-from dmil_core.methods.behaviour_cloning.method import BehaviourCloning, BehaviourCloningConfig, PerTask, PerTaskConfig
-from dmil_core.methods.nearest_neighbour.method import NearestNeighbour, NearestNeighbourConfig
+from dmil_core.methods.behaviour_cloning.config import BehaviourCloningConfig
+from dmil_core.methods.behaviour_cloning.method import BehaviourCloning
+from dmil_core.methods.nearest_neighbour.config import NearestNeighbourConfig
+from dmil_core.methods.nearest_neighbour.method import NearestNeighbour
+from dmil_core.methods.per_task.config import PerTaskConfig
+from dmil_core.methods.per_task.method import PerTask
 from dmil_core.networks import flatten, unflatten
 from dmil_core.seeding import named_rng
 from tests.dmil_core.methods.toys import meta_trained, record, training_sets

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dmil_core.methods.mil.config import MilConfig
-from dmil_core.methods.nearest_neighbour.method import NearestNeighbourConfig
+from dmil_core.methods.nearest_neighbour.config import NearestNeighbourConfig
 from dmil_core.methods.registry import OURS, MethodError, config_type, method_names, method_type
 
 NEAREST = "from dmil_core.methods.nearest_neighbour.method import NearestNeighbour as Nearest"

@@ -22,7 +22,7 @@ from dmil_core.methods.base import (
     Policy,
     Rollout,
 )
-from dmil_core.methods.behaviour_cloning.method import NetworkPolicy
+from dmil_core.methods.behaviour_cloning.policy import NetworkPolicy
 from dmil_core.methods.registry import OURS, method_type
 from dmil_core.networks import initialise, network, unflatten
 from dmil_core.seeding import named_rng

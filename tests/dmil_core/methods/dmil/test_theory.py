@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch.distributions import Independent, Normal
 
 from dmil_core.losses import Steps
-from dmil_core.methods.dmil.adaptation import Hierarchy, adapt, choose, high_level_slope, label, sub_skill_slopes
+from dmil_core.methods.dmil.adaptation import Hierarchy, adapt, choose, high_level_gradient, label, sub_skill_gradients
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.networks import Parameters, bank, mlp, network
 
@@ -46,13 +46,13 @@ def test_theorem_2_the_low_m_step_ascends_the_likelihood(leaves, steps, gradient
     high, low = Hierarchy.of(leaves)
     chosen = choose(high, steps.states)
     counts = torch.bincount(chosen, minlength=SUB_SKILLS).tolist()
-    slopes = sub_skill_slopes(low, steps, chosen)
-    assert len(slopes) > 1
-    assert set(slopes) == {k for k, count in enumerate(counts) if count}
+    gradients = sub_skill_gradients(low, steps, chosen)
+    assert len(gradients) > 1
+    assert set(gradients) == {k for k, count in enumerate(counts) if count}
     likelihood = log_likelihoods(leaves, steps, sigma).gather(0, chosen[None]).sum()
     names = [name for name in leaves if name.startswith("low")]
     of_likelihood = torch.autograd.grad(likelihood, [leaves[name] for name in names])
-    for k, of_loss in slopes.items():
+    for k, of_loss in gradients.items():
         for ascent, descent in zip(of_likelihood, itertools.chain(*gradient_of(of_loss)), strict=True):
             torch.testing.assert_close(ascent[k], -counts[k] / (2 * sigma**2) * descent, rtol=1e-9, atol=1e-12)
 
@@ -79,7 +79,7 @@ def test_theorem_2_cross_entropy_drives_the_mixture_to_its_maximum(leaves, steps
     maximum = log_likelihoods(leaves, steps, sigma).amax(0).mean()
     optimiser, gaps = torch.optim.Adam(itertools.chain(*high), lr=0.05), []
     for _ in range(600):
-        of_loss = high_level_slope(high, steps, labels, CONFIG)
+        of_loss = high_level_gradient(high, steps, labels, CONFIG)
         gaps.append((maximum - log_mixture(leaves, steps, sigma).mean()).item())
         assert 0 <= gaps[-1] <= of_loss.loss.value.item()
         for leaf, gradient in zip(itertools.chain(*high), itertools.chain(*gradient_of(of_loss)), strict=True):
@@ -91,7 +91,7 @@ def test_theorem_2_cross_entropy_drives_the_mixture_to_its_maximum(leaves, steps
 def test_theorem_2_the_high_gradients_agree_as_the_sub_skills_get_certain(leaves, steps, gradient_of) -> None:
     """Equation 21 holds in the limit of small σ, where the responsibilities become the labels."""
     high, low = Hierarchy.of(leaves)
-    of_loss = high_level_slope(high, steps, label(low, steps), CONFIG)
+    of_loss = high_level_gradient(high, steps, label(low, steps), CONFIG)
     descent = torch.cat([gradient.flatten() for gradient in itertools.chain(*gradient_of(of_loss))])
 
     def gap(sigma: float) -> float:
@@ -121,7 +121,7 @@ def test_lemma_1_one_inner_step_ascends_the_log_likelihood(linear, steps) -> Non
     mean, variance = as_matrix(linear), len(inputs) / 2
     ascent = (steps.actions - inputs @ mean.T).T @ inputs / variance
     adapted = adapt(Hierarchy.of(linear), steps, steps, CONFIG, steps=1)
-    torch.testing.assert_close(as_matrix(adapted.hierarchy.parameters), mean + 0.05 * ascent, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(as_matrix(adapted.parameters), mean + 0.05 * ascent, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("inner_steps", [1, 3, 10])
@@ -138,4 +138,4 @@ def test_lemma_1_early_stopping_is_the_map_estimate_of_a_gaussian_prior(linear, 
     data = 2 * inputs.T @ steps.actions / len(inputs)
     mode = torch.linalg.solve(hessian + precision, data + precision @ prior_mean.T).T
     adapted = adapt(Hierarchy.of(linear), steps, steps, CONFIG, steps=inner_steps)
-    torch.testing.assert_close(as_matrix(adapted.hierarchy.parameters), mode, rtol=1e-9, atol=1e-10)
+    torch.testing.assert_close(as_matrix(adapted.parameters), mode, rtol=1e-9, atol=1e-10)

@@ -10,8 +10,9 @@ import torch
 from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import DemonstrationError, Normalisation
 from dmil_core.methods.base import FineTuning, MetaLearner
+from dmil_core.methods.mil.config import MilConfig
 from dmil_core.methods.mil.losses import Support, inner_loss
-from dmil_core.methods.mil.method import Mil, MilBatch, MilConfig
+from dmil_core.methods.mil.method import Mil, MilBatch
 from dmil_core.methods.mil.transformer import cached, decode, encode
 from dmil_core.networks import Parameters, flatten
 from dmil_core.seeding import named_rng
@@ -44,7 +45,7 @@ def test_the_paper_s_sizes() -> None:
 
 @pytest.mark.parametrize("size", ["paper", "quick", "smoke"])
 def test_sizes_are_settings(size: str) -> None:
-    wanted = MilConfig.sizes[size]
+    wanted = MilConfig.presets[size]
     config = MilConfig.model_validate(wanted.get("method", {}))
     TrainingConfig.model_validate(wanted.get("training", {}))
     assert wanted["evaluation"] == {

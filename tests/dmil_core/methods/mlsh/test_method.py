@@ -11,7 +11,7 @@ from dmil_core.configs import ExperimentConfig, TrainingConfig
 from dmil_core.demonstrations import DemonstrationError
 from dmil_core.losses import Steps
 from dmil_core.methods.base import FineTuning, MetaLearner
-from dmil_core.methods.mlsh import method as mlsh
+from dmil_core.methods.mlsh import learning as mlsh
 from dmil_core.methods.mlsh.config import MlshConfig
 from dmil_core.methods.mlsh.macro_steps import draw_batch, macro_steps
 from dmil_core.methods.mlsh.method import Mlsh
@@ -49,7 +49,7 @@ def test_initial_parameters_are_the_bank_with_a_value_each(method) -> None:
 
 @pytest.mark.parametrize("size", ["paper", "quick", "smoke"])
 def test_the_sizes_are_settings(size: str) -> None:
-    own = MlshConfig.sizes[size]
+    own = MlshConfig.presets[size]
     config = MlshConfig.model_validate(own.get("method", {}))
     training = TrainingConfig.model_validate(own["training"])
     assert (training.outer_step, training.learning_rate, training.gradient_clip) == ("average", 1.0, None)
@@ -89,13 +89,13 @@ def test_parameters_minus_the_gradient_are_where_the_slot_arrived(demonstrations
     parameters = method.initial_parameters(named_rng(0, "initial"))
     learned = []
 
-    class Watched(mlsh._Learning):
+    class Watched(mlsh.Learner):
         def descend(self, loss) -> None:
             super().descend(loss)
             if "low.0.weight" in self.parameters:
                 learned.append(flatten({n: t.detach() for n, t in self.parameters.items()}))
 
-    monkeypatch.setattr(mlsh, "_Learning", Watched)
+    monkeypatch.setattr(mlsh, "Learner", Watched)
     gradient = method.task_gradient(parameters, method.sample(demonstrations, 0, named_rng(0, "batch"))).gradient
     assert len(learned) == 1
     torch.testing.assert_close(flatten(parameters) - gradient, learned[-1], rtol=0, atol=1e-6)
@@ -117,7 +117,7 @@ def test_the_metrics_are_those_of_the_policy_of_the_slot(method, demonstrations)
 def test_as_many_updates_as_asked_in_passes_over_each_batch(method, demonstrations, monkeypatch, updates: int) -> None:
     taken, batches = [], []
 
-    class Counted(mlsh._Learning):
+    class Counted(mlsh.Learner):
         def descend(self, loss) -> None:
             taken.append(loss.item())
             super().descend(loss)
@@ -126,7 +126,7 @@ def test_as_many_updates_as_asked_in_passes_over_each_batch(method, demonstratio
         batches.append(len(taken))
         return draw_batch(*arguments)
 
-    monkeypatch.setattr(mlsh, "_Learning", Counted)
+    monkeypatch.setattr(mlsh, "Learner", Counted)
     monkeypatch.setattr(mlsh, "draw_batch", counted)
     method.adapt(method.initial_parameters(named_rng(0, "initial")), demonstrations[:1], FineTuning(updates, 1e-3))
     assert len(taken) == updates
@@ -138,7 +138,7 @@ def test_at_a_batchs_first_update_the_loss_of_the_high_level_is_plain_policy_gra
     config = SMALL_MLSH.model_copy(update={"value_weight": 0.7})
     method = Mlsh.prepared(config, 3, demonstrations)
     steps = Steps.of(demonstrations[:3], method.normalise)  # 19 steps: macro-steps of 3, 3, 1 | 3 | 3, 3, 3
-    task = mlsh._Task(steps, config, generator())
+    task = mlsh.TaskLearning(steps, config, generator())
     high = method._fresh_high(np.random.default_rng(0), 1e-3)
     picks = task._pick(high, steps.states, steps.lengths)
     errors = torch.rand(19, generator=generator(1))
@@ -163,18 +163,18 @@ def test_a_joint_update_goes_down_the_policy_gradients_of_both_levels(demonstrat
     config = SMALL_MLSH.model_copy(update={"value_weight": 0.7, "batch_size": 19})
     method = Mlsh.prepared(config, 3, demonstrations)
     steps = Steps.of(demonstrations[:3], method.normalise)  # 19 steps: one batch takes each trajectory once
-    bank = mlsh._Learning(method.initial_parameters(named_rng(0, "initial")), 1e-4)
+    bank = mlsh.Learner(method.initial_parameters(named_rng(0, "initial")), 1e-4)
     high = method._fresh_high(np.random.default_rng(0), 1e-3)
     levels = [high, bank]
     before = [
         {name: tensor.detach().clone().requires_grad_() for name, tensor in level.parameters.items()}
         for level in levels
     ]
-    mlsh._Task(steps, config, generator()).learn(high, bank, 1)
+    mlsh.TaskLearning(steps, config, generator()).learn(high, bank, 1)
 
-    again = mlsh._Task(steps, config, generator())
+    again = mlsh.TaskLearning(steps, config, generator())
     index, lengths = again._draw_batch()
-    fresh = mlsh._Learning(before[0], 1e-3)
+    fresh = mlsh.Learner(before[0], 1e-3)
     picks = again._pick(fresh, steps.states[index], lengths)
     z = picks.chosen[macro_steps(lengths, 3).of_step]
     assert len(set(z.tolist())) > 1
@@ -208,7 +208,7 @@ def _standard(advantages: torch.Tensor) -> torch.Tensor:
 
 def test_sub_skills_are_drawn_as_often_as_the_high_level_says(demonstrations) -> None:
     method = Mlsh.prepared(SMALL_MLSH, 3, demonstrations)
-    task = mlsh._Task(Steps.of(demonstrations, method.normalise), SMALL_MLSH, generator())
+    task = mlsh.TaskLearning(Steps.of(demonstrations, method.normalise), SMALL_MLSH, generator())
     high = method._fresh_high(np.random.default_rng(0), 1e-3)
     with torch.no_grad():
         high.parameters["high.2.weight"].zero_()
@@ -231,7 +231,7 @@ def test_sub_skills_go_down_the_expected_squared_error(demonstrations) -> None:
     config = SMALL_MLSH.model_copy(update={"deviation": 0.2})
     method = Mlsh.prepared(config, 3, demonstrations)
     steps = Steps.of(demonstrations[:1], method.normalise)
-    task = mlsh._Task(steps, config, generator())
+    task = mlsh.TaskLearning(steps, config, generator())
     means = torch.randn(7, 3, generator=generator(1)).requires_grad_()
     (expected,) = torch.autograd.grad(-(means - steps.actions).square().sum(-1).mean(), means)
     draws = 40_000

@@ -8,10 +8,10 @@ import torch
 
 from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import FineTuning
-from dmil_core.methods.mlsh import method as mlsh
 from dmil_core.methods.mlsh.config import MlshConfig
-from dmil_core.methods.mlsh.method import Mlsh, MlshPolicy
-from dmil_core.networks import flatten, mlp
+from dmil_core.methods.mlsh.method import Mlsh
+from dmil_core.methods.mlsh.policy import MlshPolicy
+from dmil_core.networks import flatten, initialise, mlp, network
 from dmil_core.seeding import named_rng
 from tests.dmil_core.methods.conftest import SMALL_MLSH
 from tests.dmil_core.methods.toys import act_along
@@ -27,7 +27,7 @@ def policy(method) -> MlshPolicy:
     """Return a policy of random networks, its choice anything but constant."""
     bank = method.initial_parameters(named_rng(1, "initial"))
     adapted = method.adapt(bank, [demonstration_of(np.zeros((1, 4)))], FineTuning(0, 0.1))
-    high = mlsh.network(mlsh.initialise("high", [4, 8, 3], named_rng(0, "high")), "high")
+    high = network(initialise("high", [4, 8, 3], named_rng(0, "high")), "high")
     return MlshPolicy(high, adapted.low, adapted.macro_step, adapted.normalise)
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.distributions import Normal
 
-from dmil_core.configs import SIZES, EvaluationConfig, TrainingConfig
+from dmil_core.configs import BASE_PRESETS, EvaluationConfig, TrainingConfig
 from dmil_core.losses import Steps
 from dmil_core.methods.base import FineTuning, MetaLearner, OnlineMetaLearner, Policy, Rollout
 from dmil_core.methods.option_gail.method import (
@@ -18,7 +18,7 @@ from dmil_core.methods.option_gail.method import (
     OptionGailOffline,
     OptionGailOfflineConfig,
 )
-from dmil_core.methods.option_gail.option_model import Chain, log_likelihood, viterbi
+from dmil_core.methods.option_gail.option_model import Chain, posterior, viterbi
 from dmil_core.networks import Parameters, flatten, unflatten
 from dmil_core.seeding import named_rng
 from tests.dmil_core.methods.conftest import OFFLINE, PLAYING, drawn_parameters, model_of
@@ -38,9 +38,9 @@ def test_they_are_what_their_types_say(offline, playing) -> None:
 @pytest.mark.parametrize("size", ["paper", "quick", "smoke"])
 @pytest.mark.parametrize("config_type", [OptionGailOfflineConfig, OptionGailConfig])
 def test_every_size_has_all_of_its_phases(config_type, size: str) -> None:
-    own = config_type.sizes[size]
+    own = config_type.presets[size]
     config = config_type(**own.get("method", {}))
-    common = SIZES[size]
+    common = BASE_PRESETS[size]
     training = TrainingConfig(**common.training.model_dump() | own.get("training", {}))
     EvaluationConfig(**common.evaluation.model_dump() | own["evaluation"])
     assert training.iterations % training.checkpoint_every == 0
@@ -109,7 +109,7 @@ def test_gradient_is_that_of_the_likelihood(offline, demonstrations) -> None:
     batch = offline.sample(demonstrations, 0, named_rng(0, "batch"))
     steps, model = Steps.of(batch.demonstrations, offline.normalise), model_of(parameters)
     chain = Chain.of(model.log_high(steps.states), model.log_low(steps.states, steps.actions), steps.lengths)
-    loss = -log_likelihood(chain).sum() / len(steps.states)
+    loss = -posterior(chain)[0].sum() / len(steps.states)
     expected = torch.autograd.grad(loss, list(parameters.values()))
     found = offline.task_gradient(parameters, batch)
     assert found.metrics["loss"] == pytest.approx(loss.item(), rel=1e-5)
@@ -196,7 +196,7 @@ def test_adaptation_raises_the_likelihood_of_the_support(offline, demonstrations
     for count in (0, 20):
         model = offline.adapt(parameters, demonstrations[:2], FineTuning(count, 0.01)).model
         chain = Chain.of(model.log_high(steps.states), model.log_low(steps.states, steps.actions), steps.lengths)
-        found.append(log_likelihood(chain).sum().item())
+        found.append(posterior(chain)[0].sum().item())
     assert found[1] > found[0]
 
 

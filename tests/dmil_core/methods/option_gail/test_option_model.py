@@ -11,7 +11,7 @@ from torch.distributions import Normal
 from dmil_core.methods.option_gail.option_model import (
     Chain,
     OptionModel,
-    log_likelihood,
+    _forward,
     options_before,
     pairs_of,
     posterior,
@@ -21,6 +21,11 @@ from dmil_core.methods.option_gail.option_model import (
 from dmil_core.networks import Parameters, initialise
 
 RAGGED = [4, 1, 5, 2]
+
+
+def log_likelihood(chain: Chain) -> torch.Tensor:
+    """Return log p of the actions by the forward algorithm, with a gradient."""
+    return _forward(chain)[-1].logsumexp(-1)
 
 
 def draw_scores(seed: int, options: int, steps: int, scale: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dmil_core.demonstrations import Normalisation
+from dmil_core.methods.pemirl.config import PemirlConfig
 from dmil_core.methods.pemirl.losses import (
     Gaussian,
     Losses,
@@ -22,7 +23,7 @@ from dmil_core.methods.pemirl.losses import (
     losses_of,
     policy_surrogate,
 )
-from dmil_core.methods.pemirl.method import Pemirl, PemirlConfig
+from dmil_core.methods.pemirl.method import Pemirl
 from dmil_core.networks import Parameters, network
 from dmil_core.seeding import named_rng
 

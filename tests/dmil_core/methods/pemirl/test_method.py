@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from dmil_core.configs import SIZES, TrainingConfig
+from dmil_core.configs import BASE_PRESETS, TrainingConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError, Normalisation
 from dmil_core.methods.base import FineTuning, MetaLearner, Policy
-from dmil_core.methods.behaviour_cloning.method import BehaviourCloning, BehaviourCloningConfig
+from dmil_core.methods.behaviour_cloning.config import BehaviourCloningConfig
+from dmil_core.methods.behaviour_cloning.method import BehaviourCloning
+from dmil_core.methods.pemirl.config import PemirlConfig
 from dmil_core.methods.pemirl.losses import Transitions, action_distribution, infer, losses_of
-from dmil_core.methods.pemirl.method import ContextBatch, Pemirl, PemirlConfig
+from dmil_core.methods.pemirl.method import ContextBatch, Pemirl
 from dmil_core.networks import flatten, network
 from dmil_core.seeding import named_rng
 from tests.dmil_core.methods.toys import STEPS, collect_rollouts, meta_trained, record, training_sets
@@ -32,8 +34,8 @@ def test_defaults_are_those_of_table_12() -> None:
     config = PemirlConfig()
     assert (config.trajectories, config.discount, config.information_weight) == (16, 1.0, 0.1)
     assert (config.hidden_layers, config.reward_layers, config.hidden_units) == (4, 3, 512)
-    assert SIZES["paper"].training.learning_rate == 1e-4
-    for size in PemirlConfig.sizes.values():
+    assert BASE_PRESETS["paper"].training.learning_rate == 1e-4
+    for size in PemirlConfig.presets.values():
         PemirlConfig.model_validate(size["method"])
 
 

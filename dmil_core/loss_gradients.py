@@ -19,8 +19,8 @@ from dmil_core.networks import Layer, Network, activations, blocks
 _relu_backward = torch.ops.aten.threshold_backward.grad_input
 
 
-class Slope(NamedTuple):
-    """A network's loss at one point of its parameters: the value, the gradient in factors, the curvature."""
+class LossGradient(NamedTuple):
+    """Loss of a network at given parameters: the value, the gradient in factors, and the Hessian."""
 
     network: Network
     inputs: list[list[Float[Tensor, "block _"]]]
@@ -30,7 +30,7 @@ class Slope(NamedTuple):
     outputs: Float[Tensor, "steps outputs"]
     loss: OutputLoss
 
-    def add_gradient(self, vector: Network, scale: float = 1.0) -> None:
+    def add_to(self, vector: Network, scale: float = 1.0) -> None:
         """Add `scale` times the gradient to `vector`, in place."""
         for inputs, deltas in zip(self.inputs, self.deltas, strict=True):
             for (weight, bias), value, delta in zip(vector, inputs, deltas, strict=True):
@@ -38,12 +38,12 @@ class Slope(NamedTuple):
                 bias.add_(delta.sum(0), alpha=scale)
 
     def descend(self, learning_rate: float, *, in_place: bool = False) -> Network:
-        """Return the network after one step of gradient descent; in place, this slope's own network is gone."""
+        """Return the network after one step of gradient descent; with `in_place`, `self.network` is overwritten."""
         stepped = self.network if in_place else tuple(Layer(*map(torch.clone, layer)) for layer in self.network)
-        self.add_gradient(stepped, -learning_rate)
+        self.add_to(stepped, -learning_rate)
         return stepped
 
-    def pull_back(self, vector: Network, learning_rate: float) -> None:
+    def jacobian_product(self, vector: Network, learning_rate: float) -> None:
         """Multiply `vector` in place by the Jacobian of `descend`, I − αH, which is symmetric.
 
         H v is the derivative of the gradient along v (Pearlmutter, "Fast exact multiplication by the Hessian",
@@ -69,19 +69,19 @@ class Slope(NamedTuple):
                     weight.addmm_(deltas[index].mT, tangent[index - 1], alpha=-learning_rate)
 
 
-def slope(
+def loss_gradient(
     network: Network,
     inputs: Float[Tensor, "steps inputs"],
     loss: Callable[[Float[Tensor, "steps outputs"]], OutputLoss],
-) -> Slope:
-    """Run a network forward and its loss backward."""
+) -> LossGradient:
+    """Return a network's loss and its gradient: one forward and one backward pass."""
     values = [activations(network, block) for block in blocks(inputs)]
     outputs = torch.cat([block.pop() for block in values])
     at_outputs = loss(outputs)
     deltas = [
         _deltas(network, block, gradient) for block, gradient in zip(values, blocks(at_outputs.gradient), strict=True)
     ]
-    return Slope(network, values, deltas, outputs, at_outputs)
+    return LossGradient(network, values, deltas, outputs, at_outputs)
 
 
 def _deltas(network: Network, inputs: list[Tensor], gradient: Tensor) -> list[Tensor]:

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.nn import functional
 
+from dmil_core.loss_gradients import LossGradient, loss_gradient
 from dmil_core.losses import OutputLoss, behaviour_cloning_loss, high_level_loss
 from dmil_core.methods.dmil.adaptation import Hierarchy
 from dmil_core.networks import BLOCK, Layer, Network
-from dmil_core.slopes import Slope, slope
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
 WIDTHS = {1: (), 2: (7,), 4: (7, 5, 6)}
@@ -34,8 +34,8 @@ class Problem(NamedTuple):
     plain: Callable[[torch.Tensor], torch.Tensor]
 
     @property
-    def slope(self) -> Slope:
-        return slope(self.network, self.inputs, self.loss)
+    def loss_gradient(self) -> LossGradient:
+        return loss_gradient(self.network, self.inputs, self.loss)
 
 
 def mean_squared_error(outputs: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
@@ -123,14 +123,14 @@ def plain_gradient(problem: Problem, plain_mlp: PlainMlp) -> torch.Tensor:
     return torch.autograd.grad(plain_loss(problem, plain_mlp, vector), vector)[0]
 
 
-def pulled_back(of: Slope, vector: torch.Tensor, learning_rate: float = RATE) -> torch.Tensor:
+def pulled_back(of: LossGradient, vector: torch.Tensor, learning_rate: float = RATE) -> torch.Tensor:
     network = shaped(vector, of.network)
-    of.pull_back(network, learning_rate)
+    of.jacobian_product(network, learning_rate)
     return flat(network)
 
 
 def test_value_and_gradient_equal_autograd(problem, plain_mlp, gradient_of, dtype) -> None:
-    got = problem.slope
+    got = problem.gradient
     expected = plain_mlp(problem.network, problem.inputs)
     torch.testing.assert_close(got.outputs, expected)
     assert got.loss.value.item() == pytest.approx(problem.plain(expected).item(), rel=TOLERANCE[dtype])
@@ -140,18 +140,18 @@ def test_value_and_gradient_equal_autograd(problem, plain_mlp, gradient_of, dtyp
 
 
 def test_the_gradient_is_added_to_what_is_there(problem, plain_mlp, dtype) -> None:
-    before, got = normal_like(problem.network, 4), problem.slope
+    before, got = normal_like(problem.network, 4), problem.gradient
     vector = shaped(before, problem.network)
-    got.add_gradient(vector, -3.0)
+    got.add_to(vector, -3.0)
     wanted = before - 3 * plain_gradient(problem, plain_mlp)
     assert relative_error(flat(vector), wanted) <= TOLERANCE[dtype]
-    got.add_gradient(vector, 3.0)
+    got.add_to(vector, 3.0)
     assert relative_error(flat(vector), before) <= TOLERANCE[dtype]
     assert relative_error(wanted, before) > 1e-2
 
 
 def test_descend_takes_one_step_and_leaves_the_network(problem, plain_mlp, dtype) -> None:
-    before, got = flat(problem.network), problem.slope
+    before, got = flat(problem.network), problem.gradient
     wanted = before - RATE * plain_gradient(problem, plain_mlp)
     stepped = got.descend(RATE)
     assert relative_error(flat(stepped), wanted) <= TOLERANCE[dtype]
@@ -162,7 +162,7 @@ def test_descend_takes_one_step_and_leaves_the_network(problem, plain_mlp, dtype
 
 
 def test_descend_in_place_overwrites_the_networks_own_tensors(problem, dtype) -> None:
-    got, own = problem.slope, list(itertools.chain(*problem.network))
+    got, own = problem.gradient, list(itertools.chain(*problem.network))
     expected = flat(got.descend(RATE))
     stepped = got.descend(RATE, in_place=True)
     assert all(one is other for one, other in zip(itertools.chain(*stepped), own, strict=True))
@@ -174,7 +174,7 @@ def test_descend_in_place_overwrites_the_networks_own_tensors(problem, dtype) ->
 def test_a_step_of_a_sub_skill_touches_its_row_of_the_bank_alone(make_parameters, make_steps) -> None:
     parameters, before = make_parameters(0, 3), make_parameters(0, 3)
     states, actions, _ = make_steps(0, [6])
-    of = slope(Hierarchy.of(parameters).low[1], states, partial(behaviour_cloning_loss, actions=actions))
+    of = loss_gradient(Hierarchy.of(parameters).low[1], states, partial(behaviour_cloning_loss, actions=actions))
     of.descend(RATE, in_place=True)
     for name, tensor in parameters.items():
         if name.startswith("low"):
@@ -185,7 +185,7 @@ def test_a_step_of_a_sub_skill_touches_its_row_of_the_bank_alone(make_parameters
 @pytest.mark.parametrize("hidden", [(), (5,), (5, 3, 4)], ids=["depth 1", "depth 2", "depth 4"])
 def test_pull_back_multiplies_by_identity_minus_the_scaled_hessian(problem, plain_mlp, dtype) -> None:
     """Column by column, against the Hessian of plain autograd."""
-    origin, got = flat(problem.network), problem.slope
+    origin, got = flat(problem.network), problem.gradient
     hessian: Any = torch.autograd.functional.hessian(partial(plain_loss, problem, plain_mlp), origin)
     identity = torch.eye(len(origin), dtype=dtype)
     columns = torch.stack([pulled_back(got, unit) for unit in identity], 1)
@@ -198,7 +198,7 @@ def test_pull_back_equals_a_hessian_vector_product(problem, plain_mlp, dtype) ->
     leaf = flat(problem.network).requires_grad_()
     (gradient,) = torch.autograd.grad(plain_loss(problem, plain_mlp, leaf), leaf, create_graph=True)
     (product,) = torch.autograd.grad(gradient, leaf, vector)
-    assert relative_error(pulled_back(problem.slope, vector), vector - RATE * product) <= TOLERANCE[dtype]
+    assert relative_error(pulled_back(problem.gradient, vector), vector - RATE * product) <= TOLERANCE[dtype]
 
 
 @pytest.mark.parametrize("dtype", [torch.float64], ids=str)
@@ -207,10 +207,10 @@ def test_pull_back_is_the_derivative_of_descend(problem) -> None:
     direction = functional.normalize(normal_like(problem.network, 5), dim=0)
 
     def descended(vector: torch.Tensor) -> torch.Tensor:
-        return flat(problem._replace(network=shaped(vector, problem.network)).slope.descend(RATE))
+        return flat(problem._replace(network=shaped(vector, problem.network)).gradient.descend(RATE))
 
     differences = (descended(origin + step * direction) - descended(origin - step * direction)) / (2 * step)
-    assert relative_error(pulled_back(problem.slope, direction), differences) < 1e-7
+    assert relative_error(pulled_back(problem.gradient, direction), differences) < 1e-7
     assert relative_error(direction, differences) > 1e-2
 
 
@@ -228,7 +228,7 @@ problems = st.fixed_dictionaries(
 def test_any_network_and_loss(make_problem, plain_mlp, gradient_of, drawn: dict, learning_rate: float) -> None:
     """Gradient and curvature equal those of plain autograd, and the Jacobian is symmetric."""
     problem = make_problem(**drawn)
-    got, one, other = problem.slope, normal_like(problem.network, 0), normal_like(problem.network, 1)
+    got, one, other = problem.gradient, normal_like(problem.network, 0), normal_like(problem.network, 1)
     leaf = flat(problem.network).requires_grad_()
     (gradient,) = torch.autograd.grad(plain_loss(problem, plain_mlp, leaf), leaf, create_graph=True)
     (product,) = torch.autograd.grad(gradient, leaf, one)
@@ -239,7 +239,7 @@ def test_any_network_and_loss(make_problem, plain_mlp, gradient_of, drawn: dict,
 
 
 def test_pull_back_is_linear_and_leaves_the_slope(problem, dtype) -> None:
-    got, one, other = problem.slope, normal_like(problem.network, 0), normal_like(problem.network, 1)
+    got, one, other = problem.gradient, normal_like(problem.network, 0), normal_like(problem.network, 1)
     blocks = itertools.chain(*got.inputs, *got.deltas)
     tensors = [*itertools.chain(*got.network), *blocks, got.outputs, got.loss.value, got.loss.gradient]
     before = [tensor.clone() for tensor in tensors]
@@ -252,7 +252,7 @@ def test_pull_back_is_linear_and_leaves_the_slope(problem, dtype) -> None:
 
 def test_no_slope_changes_its_inputs_or_carries_a_graph(problem, gradient_of) -> None:
     inputs, before = problem.inputs.clone(), flat(problem.network)
-    got = problem.slope
+    got = problem.gradient
     hidden = itertools.chain(*(block[1:] for block in got.inputs), *got.deltas)
     derived = [*hidden, got.outputs, *got.loss[:2], flat(gradient_of(got)), flat(got.descend(RATE))]
     assert not any(tensor.requires_grad for tensor in derived)
@@ -266,7 +266,7 @@ def test_units_that_never_fire_have_no_slope(make_problem, plain_mlp, gradient_o
     problem = make_problem(0, (6, 5), [8, 3], None)
     problem.network[0].weight[:2] = 0
     problem.network[0].bias[:2] = torch.tensor([0.0, -3.0])
-    got = problem.slope
+    got = problem.gradient
     assert not got.inputs[0][1][:, :2].any()
     gradient, vector = gradient_of(got), normal_like(problem.network, 0)
     assert relative_error(flat(gradient), plain_gradient(problem, plain_mlp)) <= 1e-10
@@ -278,5 +278,5 @@ def test_units_that_never_fire_have_no_slope(make_problem, plain_mlp, gradient_o
     for silent in problem.network[:-1]:
         silent.weight.zero_()
         silent.bias.fill_(-1)
-    assert relative_error(flat(gradient_of(problem.slope)), plain_gradient(problem, plain_mlp)) <= 1e-10
-    assert flat(gradient_of(problem.slope)[:-1]).count_nonzero() == 0
+    assert relative_error(flat(gradient_of(problem.gradient)), plain_gradient(problem, plain_mlp)) <= 1e-10
+    assert flat(gradient_of(problem.gradient)[:-1]).count_nonzero() == 0

@@ -1,0 +1,34 @@
+"""The policy of DMIL."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Int64
+
+from dmil_core.demonstrations import Demonstration, Normalisation
+from dmil_core.losses import Steps
+from dmil_core.methods.base import Decision, Memoryless, SubSkillUse
+from dmil_core.methods.dmil import adaptation
+from dmil_core.methods.dmil.adaptation import Hierarchy
+
+
+@dataclass(frozen=True)
+class DmilPolicy(Memoryless):
+    """The most probable sub-skill acts: a = π_k(s), k = argmax π_h(s)."""
+
+    hierarchy: Hierarchy
+    normalise: Normalisation
+
+    def act(
+        self, observations: Float32[np.ndarray, "episodes obs_dim"], memory: Int64[np.ndarray, "episodes 0"]
+    ) -> Decision:
+        """Choose one action and its sub-skill for each episode."""
+        actions, chosen = adaptation.act(self.hierarchy, torch.from_numpy(self.normalise(observations)))
+        return Decision(actions.numpy(), chosen.numpy(), memory)
+
+    def sub_skill_use(self, demonstration: Demonstration) -> SubSkillUse:
+        """Return the high level's choice and the argmin label (equation 3) at each step."""
+        steps = Steps.of([demonstration], self.normalise)
+        chosen = adaptation.choose(self.hierarchy.high, steps.states)
+        return SubSkillUse(chosen.numpy(), adaptation.label(self.hierarchy.low, steps).numpy())

@@ -1,0 +1,30 @@
+"""Behaviour cloning from fresh weights on the support set alone."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from dmil_core.demonstrations import Demonstration
+from dmil_core.losses import Steps
+from dmil_core.methods.base import FineTuning, Method
+from dmil_core.methods.behaviour_cloning.policy import NetworkPolicy, fine_tuned, initial_network
+from dmil_core.methods.per_task.config import PerTaskConfig
+from dmil_core.networks import Parameters, network
+
+
+class PerTask(Method[PerTaskConfig]):
+    """Behaviour cloning from fresh weights on the support set alone."""
+
+    config_type = PerTaskConfig
+
+    def initial_parameters(self, rng: np.random.Generator) -> Parameters:
+        """Draw the network."""
+        return initial_network(self.config, self.obs_dim, self.action_dim, rng)
+
+    def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> NetworkPolicy:
+        """Take steps of Adam on the support set."""
+        steps = Steps.of(support, self.normalise)
+        return NetworkPolicy(
+            fine_tuned(network(parameters, "policy"), steps, torch.optim.Adam, fine_tuning), self.normalise
+        )
