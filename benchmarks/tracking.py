@@ -27,9 +27,9 @@ from benchmarks.workload import made_up_plan
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.distributed.runner import Iteration, LocalMetaTraining
-from services.tracking import Tracker
 from services.tracking.delivery import Identity
 from services.tracking.spool import read_spool
+from services.tracking.tracker import Tracker
 
 DELAY = 10.0
 """Seconds that the slow server waits before each answer."""

@@ -21,7 +21,8 @@ from services.demonstrations.store import data_root
 from services.distributed.cluster import joined
 from services.distributed.node_info import NodeFacts, cluster_facts, facts
 from services.storage.files import DiskFullError, write_file
-from services.tracking import in_words, redacted, tracking_uri
+from services.tracking.delivery import set_mlflow_defaults
+from services.tracking.links import in_words, redacted, tracking_uri
 
 Verdict = Literal["good", "warning", "bad"]
 DISK_BYTES = 2 * 10**9
@@ -175,6 +176,7 @@ def _storage(what: str, folder: Path, mark: str) -> Iterator[Finding]:
 def _mlflow() -> Finding:
     """Make a run in MLflow and delete it."""
     os.environ["MLFLOW_HTTP_REQUEST_TIMEOUT"] = SECONDS_FOR_MLFLOW
+    set_mlflow_defaults()
     from mlflow import MlflowClient
 
     uri = tracking_uri()

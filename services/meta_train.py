@@ -29,8 +29,8 @@ from services.storage.files import read_file, write_file
 from services.storage.remote import STORAGE
 from services.storage.replication import replicated, restored
 from services.storage.run_folders import find_folder, new_folder
-from services.tracking import Tracker, introduce
 from services.tracking.system import recording_system
+from services.tracking.tracker import Tracker, introduce
 
 CHANGEABLE = {"iterations", "checkpoint_every", "checkpoints_kept"}
 """Settings of meta-training that a resumed run may change without becoming another run."""

@@ -28,10 +28,10 @@ from services.suites.registry import open_suite
 from services.sweeps.folders import MARK, SweepFolder, SweepRecord
 from services.sweeps.settings import Preset, Sweep, planned
 from services.sweeps.table_formats import publish, show, write_tables
-from services.tracking import Tracker, tracking_uri
 from services.tracking.delivery import IDENTITY, Identity
-from services.tracking.links import comparison_link
+from services.tracking.links import comparison_link, tracking_uri
 from services.tracking.system import recording_system
+from services.tracking.tracker import Tracker
 
 CONFIGS = Path(__file__).parents[1] / "tune_configs"
 

@@ -23,7 +23,7 @@ from services.rollouts.adaptations import Adaptation, AdaptationOutcome, Imitati
 from services.storage.checkpoints import Checkpoint, Checkpoints, iteration_of
 from services.storage.provenance import library_versions
 from services.suites.base import Split, TaskSuite
-from services.tracking import Tracker
+from services.tracking.tracker import Tracker
 
 logger = logging.getLogger(__name__)
 

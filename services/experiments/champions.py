@@ -18,8 +18,8 @@ from services.evaluation.summary import Evaluation
 from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoint
 from services.suites.registry import open_suite
-from services.tracking import in_words, redacted, tracking_uri
-from services.tracking.delivery import IDENTITY, Identity
+from services.tracking.delivery import IDENTITY, Identity, set_mlflow_defaults
+from services.tracking.links import in_words, redacted, tracking_uri
 from services.tracking.models import CHECKPOINT_TAG, checkpoint_in, models_of
 
 if TYPE_CHECKING:
@@ -55,6 +55,7 @@ def open_contest(checkpoint: Checkpoint, experiment: Experiment, folder: Path) -
         UserError: if MLflow has no model of the checkpoint, or the champion is of another protocol.
         RunError: if MLflow does not answer, or has no registry.
     """
+    set_mlflow_defaults()
     from mlflow import MlflowClient
 
     uri, name = tracking_uri(), experiment.suite.name

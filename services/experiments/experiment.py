@@ -29,7 +29,7 @@ from services.storage.checkpoints import Checkpoint, CheckpointError, Checkpoint
 from services.storage.provenance import library_versions
 from services.suites.base import Split, TaskSuite
 from services.suites.registry import open_suite
-from services.tracking import Tracker
+from services.tracking.tracker import Tracker
 
 RunnerKind = Literal["ray", "local"]
 OnNonfinite = Literal["stop", "skip"]

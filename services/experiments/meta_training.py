@@ -20,7 +20,7 @@ from services.evaluation.evaluator import Evaluations
 from services.evaluation.summary import AGAINST_COLLAPSE, COLLAPSED
 from services.experiments.iteration_metrics import figures_of, iteration_metrics, nonfinite_in_words, shares_of
 from services.storage.checkpoints import Checkpoint, Checkpoints, Manifest
-from services.tracking import Tracker
+from services.tracking.tracker import Tracker
 
 logger = logging.getLogger(__name__)
 

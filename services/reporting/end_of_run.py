@@ -6,7 +6,7 @@ from pathlib import Path
 from services.cli.progress import console
 from services.evaluation.summary import AGAINST_COLLAPSE, Summary, rates, table, table_markdown, write_summary
 from services.storage.checkpoints import Checkpoint
-from services.tracking import Tracker
+from services.tracking.tracker import Tracker
 
 PAGE = "report.html"
 """In a run's report folder."""

@@ -19,7 +19,7 @@ from services.storage.run_folders import find_folder
 from services.sweeps.compare import write_sweep_page
 from services.sweeps.folders import MARK, SweepFolder
 from services.sweeps.tables import Sample, Tables, column_of, comparison_of, tables_of
-from services.tracking import Tracker
+from services.tracking.tracker import Tracker
 
 
 def _grid(tables: Tables) -> dict[str, dict[str, Cell]]:

@@ -26,8 +26,8 @@ from services.storage.remote import given_storage
 from services.storage.replication import replicated
 from services.sweeps.folders import TRAINED, SweepFolder, TrialResult, evaluated, trained
 from services.sweeps.settings import PlannedTrial
-from services.tracking import Tracker, introduce
 from services.tracking.history import read_metrics
+from services.tracking.tracker import Tracker, introduce
 
 logger = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from services.distributed.cluster import cpus
 from services.storage.remote import STORAGE
 from services.sweeps.folders import SweepFolder, TrialResult
 from services.sweeps.trial import HELD_OUT, ITERATION, run_trial, tracker_of
-from services.tracking import tracking_uri
+from services.tracking.links import tracking_uri
 
 logger = logging.getLogger(__name__)
 

@@ -16,8 +16,8 @@ from dmil_core.errors import RunError, UserError
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.storage.run_folders import find_folder
-from services.tracking import in_words, redacted, tracking_uri
 from services.tracking.delivery import Delivery
+from services.tracking.links import in_words, redacted, tracking_uri
 from services.tracking.spool import Artifact, Spool
 
 REPORT = "report"

@@ -1,5 +1,6 @@
 """From a run's folder to MLflow: every record in its order, noted as delivered once MLflow has taken it."""
 
+import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,6 +35,21 @@ SENDING_SECONDS = 60.0
 IDENTITY = "mlflow_run.json"
 """In a run's folder."""
 IDENTITY_BYTES = 10_000
+MLFLOW_DEFAULTS = {
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "0",  # a call that MLflow's client made again by itself could make a second run
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "60",  # a slow answer is no trouble for a thread
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "MLFLOW_LOGGING_LEVEL": "WARNING",  # it would print into the live screen
+    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
+}
+
+
+def set_mlflow_defaults() -> None:
+    """Set the environment variables that MLflow's client has for settings, where they are not set.
+
+    It takes them from nowhere else, and some when it is first imported: call this before.
+    """
+    os.environ.update({name: value for name, value in MLFLOW_DEFAULTS.items() if name not in os.environ})
 
 
 class Identity(BaseModel):
@@ -106,6 +122,7 @@ class Delivery:
         Raises:
             UserError: if the identity is missing or damaged, or a record is.
         """
+        set_mlflow_defaults()
         self._folder, self._uri = folder, uri
         self._lock = FileLock(folder / "tracking.lock", thread_local=False)
         self._client: MlflowClient | None = None

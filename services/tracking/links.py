@@ -1,14 +1,36 @@
-"""Addresses of MLflow's pages: of a run, and of runs side by side."""
+"""Addresses of MLflow and of its pages: of a run, and of runs side by side."""
 
 import json
+import os
+import re
 from collections.abc import Sequence
 from urllib.parse import quote, urlsplit, urlunsplit
 
+from dmil_core.errors import RunError, UserError
+
+DEFAULT_URI = "sqlite:///mlflow.db"
 LOCAL = "http://127.0.0.1:5000"
 """Where ``mlflow ui`` serves what is no server itself."""
 
 TRAINING = "workflowType=machine_learning"
 """What has MLflow show its pages for training beside, not those for applications of language models."""
+
+
+def tracking_uri() -> str:
+    """Return ``MLFLOW_TRACKING_URI``, or an SQLite file in the working directory."""
+    return os.environ.get("MLFLOW_TRACKING_URI") or DEFAULT_URI
+
+
+def redacted(text: str) -> str:
+    """Return an address, or a text with addresses in it, without users, passwords and tokens."""
+    text = re.sub(r"://[^\s'\"]*@", "://...@", text)
+    return re.sub(r"(?i)((?:password|passwd|token|secret|key)=)[^&\s'\"]+", r"\1...", text)
+
+
+def in_words(error: Exception) -> str:
+    """Return an error of MLflow, or of what is below it, in one line without secrets."""
+    text = redacted(" ".join(str(error).split()))
+    return text if isinstance(error, UserError | RunError) else f"{type(error).__name__}: {text[:200]}"
 
 
 def run_link(uri: str, experiment_id: str, run_id: str) -> str:

@@ -19,7 +19,7 @@ import psutil
 import pytest
 
 from services.storage.checkpoints import Checkpoints
-from services.tracking import Tracker
+from services.tracking.tracker import Tracker
 
 PROJECT = Path(__file__).parents[2]
 SECURED_BY = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "RAY_USAGE_STATS_ENABLED")

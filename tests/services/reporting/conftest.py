@@ -17,7 +17,7 @@ from services.distributed.runner import LocalRunner
 from services.experiments.experiment import Experiment
 from services.experiments.finished_run import FinishedRun
 from services.storage.checkpoints import Checkpoints
-from services.tracking import Tracker
+from services.tracking.tracker import Tracker
 
 EXAMPLE = Path(__file__).parents[3] / "docs" / "examples" / "planar_visits" / "planar_visits.py"
 

@@ -20,7 +20,7 @@ from services.experiments.experiment import Experiment, open_runner
 from services.storage.checkpoints import Checkpoint, Checkpoints
 from services.storage.remote import STORAGE
 from services.sweeps.folders import SweepFolder
-from services.tracking import Tracker
+from services.tracking.tracker import Tracker
 
 
 def write_sweep(variants: dict[str, object], **changes: object) -> str:

@@ -9,8 +9,8 @@ import pytest
 from mlflow import MlflowClient
 
 from dmil_core.errors import UserError
-from services.tracking import Tracker
 from services.tracking.delivery import RUN_TAG, Delivery, Identity
+from services.tracking.tracker import Tracker
 from tests.services.tracking.conftest import steps
 
 PROJECT = Path(__file__).parents[3]

@@ -7,11 +7,11 @@ from mlflow import MlflowClient
 
 from dmil_core.errors import RunError
 from services.storage.checkpoints import Checkpoint
-from services.tracking import Tracker
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.delivery import Delivery, Identity
 from services.tracking.models import models_of
 from services.tracking.spool import read_spool
+from services.tracking.tracker import Tracker
 from tests.services.tracking.conftest import records, steps
 
 

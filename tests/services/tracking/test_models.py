@@ -17,16 +17,16 @@ from dmil_core.configs import preset_of
 from dmil_core.errors import RunError, UserError
 from dmil_core.methods.base import FineTuning
 from dmil_core.methods.registry import OURS, method_type
-from services import tracking
 from services.demonstrations.store import DemoStore
 from services.distributed.runner import LocalRunner
 from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoint, Checkpoints
-from services.tracking import Tracker
+from services.tracking import tracker as tracking
 from services.tracking.delivery import Identity
 from services.tracking.imitator import POLICIES_KEPT, Imitator
 from services.tracking.models import checkpoint_in, models_of
 from services.tracking.packing import packed
+from services.tracking.tracker import Tracker
 from tests.services.tracking import old_imitator
 
 GUIDE = Path(__file__).parents[3] / "docs" / "mlflow.md"

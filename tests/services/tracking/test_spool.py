@@ -7,10 +7,10 @@ import pytest
 
 from dmil_core.errors import UserError
 from services.storage.files import DiskFullError
-from services.tracking import Tracker
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.delivery import Identity
 from services.tracking.spool import Spool, read_spool
+from services.tracking.tracker import Tracker
 from tests.services.tracking.conftest import records
 
 

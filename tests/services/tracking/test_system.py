@@ -5,10 +5,11 @@ from pathlib import Path
 import pytest
 from mlflow import MlflowClient
 
-from services.tracking import Tracker, system
+from services.tracking import system
 from services.tracking.delivery import Identity
 from services.tracking.history import read_metrics
 from services.tracking.system import recording_system
+from services.tracking.tracker import Tracker
 from tests.services.tracking.conftest import records
 
 

@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 from mlflow import MlflowClient
 
-from services import tracking
 from services.storage import files
 from services.storage.checkpoints import Checkpoints
 from services.storage.files import DiskFullError
-from services.tracking import Tracker, redacted
+from services.tracking import tracker as tracking
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.delivery import Identity
+from services.tracking.links import redacted
+from services.tracking.tracker import Tracker
 from tests.services.conftest import Server
 from tests.services.tracking.conftest import records, steps
 

@@ -1,0 +1,221 @@
+"""MLflow tracking that never stops a run: records go to a file in the run's folder first, a thread delivers them."""
+
+import logging
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from dmil_core.configs import ExperimentConfig
+from dmil_core.demonstrations import Demonstration
+from dmil_core.errors import RunError
+from services.storage.provenance import git_commit, library_versions
+from services.tracking.delivery import Delivery, Identity
+from services.tracking.links import how_to_look, in_words, redacted, run_link, tracking_uri
+from services.tracking.packing import packed
+from services.tracking.spool import Artifact, Ended, Example, Measured, Spool, Trained
+
+logger = logging.getLogger(__name__)
+
+RETRY_SECONDS = 10.0
+LINGER_SECONDS = 1.0
+"""How long records are gathered before they are sent together."""
+SYSTEM = "system/"
+"""What MLflow's system metrics begin with."""
+DIGITS = 12
+"""Of a data set's digest, in a tag."""
+EXAMPLE_STEPS = 3
+FAREWELL_SECONDS = 3.0
+"""How long the end of a run waits for an MLflow that has failed or been slow."""
+
+
+class Tracker:
+    """One MLflow run, fed from ``tracking.jsonl`` in the run's folder."""
+
+    def __init__(self, folder: Path, experiment: str, parent: Path | None = None) -> None:
+        """Open the MLflow run that belongs to a run's folder, or make one as soon as MLflow answers.
+
+        One warning is logged when MLflow does not take records, one if some are left at the end.
+
+        Args:
+            folder: of the run; a folder that was tracked before continues the same MLflow run.
+            experiment: the MLflow experiment's name.
+            parent: the folder of the sweep that this run is a trial of.
+
+        Raises:
+            UserError: if a record of the run so far is damaged, or the file that says which MLflow run it is, is.
+            DiskFullError: for want of space.
+        """
+        uri = tracking_uri()
+        self.uri = redacted(uri)
+        """Of MLflow, without secrets."""
+        self._folder = folder
+        Identity.found_or_made(folder, experiment, None if parent is None else Identity.of(parent).tag)
+        self._spool = Spool(folder / "tracking.jsonl")
+        self._delivery = Delivery(folder, uri)
+        self._opened = time.monotonic()
+        self._closing = threading.Event()
+        self._failed = self._complained = False
+        self._thread = threading.Thread(target=self._work, name="mlflow", daemon=True)
+        self._spool.append("begin", None)
+        self._thread.start()
+
+    @property
+    def run_id(self) -> str | None:
+        """The MLflow run's id, as far as it is known."""
+        return self._delivery.run_id
+
+    @property
+    def whereabouts(self) -> list[str]:
+        """Lines that say where the MLflow run is, as far as it is known, and how to look at it."""
+        run_id, experiment_id, uri = self.run_id, self._delivery.experiment_id, tracking_uri()
+        lines = [f"MLflow run: {run_id or 'not there yet'} at {self.uri}"]
+        if (command := how_to_look(uri)) is not None:
+            lines.append(f"to look at it: {command}")
+        if run_id is not None and experiment_id is not None:
+            lines.append(f"its page: {run_link(uri, experiment_id, run_id)}")
+        return lines
+
+    @property
+    def waiting(self) -> int:
+        """How many records MLflow has not taken yet."""
+        return self._spool.count - self._delivery.delivered
+
+    def parameters(self, values: Mapping[str, Any]) -> None:
+        """Record settings; MLflow keeps the first value of each, a resumed run's other value becomes a tag."""
+        self._spool.append("parameters", {name: str(value) for name, value in values.items()})
+
+    def metrics(self, step: int, values: Mapping[str, float], *, anew: bool = False) -> None:
+        """Record metrics of one iteration, but none twice: a resumed run does some iterations again.
+
+        Args:
+            step: the iteration.
+            values: by name.
+            anew: they may have been measured again in another way; those that came out otherwise are recorded too.
+        """
+        before = {name: self._spool.measured.get(name, {}).get(step) for name in values}
+        new = {
+            name: value for name, value in values.items() if before[name] is None or (anew and before[name] != value)
+        }
+        if new:
+            self._spool.append("metrics", Measured(step=step, time=_now(), values=new))
+
+    def tags(self, values: Mapping[str, str]) -> None:
+        """Record tags; a later value replaces an earlier one."""
+        self._spool.append("tags", dict(values))
+
+    def system(self, values: Mapping[str, float]) -> None:
+        """Record the next sample of the machine's load, under the names by which MLflow knows such metrics."""
+        named = {f"{SYSTEM}{name}": value for name, value in values.items()}
+        step = 1 + max((max(self._spool.measured[name], default=-1) for name in named), default=-1)
+        self._spool.append("system", Measured(step=step, time=_now(), values=named))
+
+    def inputs(self, digests: Mapping[str, str]) -> None:
+        """Record data sets by name and digest as the run's inputs, and in one tag, by which runs are found."""
+        self._spool.append("inputs", dict(digests))
+        self.tags({"data": ", ".join(f"{name} {digest[:DIGITS]}" for name, digest in digests.items())})
+
+    def artifact(self, path: Path, folder: str | None = None) -> None:
+        """Record a file or folder below the run's folder as an artifact."""
+        below = path.absolute().relative_to(self._folder.absolute())
+        self._spool.append("artifact", Artifact(path=str(below), folder=folder))
+
+    def model(self, checkpoint: Path, support: Sequence[Demonstration]) -> None:
+        """Record a checkpoint below the run's folder as the run's model.
+
+        Args:
+            checkpoint: its folder.
+            support: demonstrations of one task, whose first steps are what the model shows as its example.
+        """
+        below = checkpoint.absolute().relative_to(self._folder.absolute())
+        parts = [demonstration.window(0, min(EXAMPLE_STEPS, len(demonstration))) for demonstration in support]
+        example = Example.model_validate(packed(parts, parts[0].observations[0]))
+        self._spool.append("model", Trained(checkpoint=str(below), example=example))
+
+    def identify(self, patience: float = 20.0) -> str | None:
+        """Return the MLflow run's id, or None if it is not known yet.
+
+        Args:
+            patience: seconds, counted from the tracker's opening, to wait for it while MLflow neither fails nor is
+                slow; 0 does not wait.
+        """
+        while self.run_id is None and not self._troubled() and time.monotonic() < self._opened + patience:
+            time.sleep(0.02)
+        return self.run_id
+
+    def close(self, status: str, patience: float = 60.0) -> bool:
+        """End the MLflow run; return whether all records have been delivered, and say so if not.
+
+        It raises nothing, so as not to hide what ended the run.
+
+        Args:
+            status: how the run ended: FINISHED, FAILED or KILLED.
+            patience: seconds to wait for the delivery while MLflow neither fails nor is slow.
+        """
+        try:
+            self._spool.append("end", Ended.model_validate({"status": status, "time": _now()}))
+        except (OSError, RunError) as error:
+            logger.warning(f"the end of the run is not recorded: {error}")
+        self._closing.set()
+        started = time.monotonic()
+        while self._thread.is_alive() and time.monotonic() < started + patience:
+            self._thread.join(0.05)
+            if self._troubled():
+                patience = min(patience, FAREWELL_SECONDS)
+        self._spool.close()
+        left = self.waiting
+        if left:
+            logger.warning(
+                f"{left} of {self._spool.count} MLflow records wait in {self._spool.path}; when MLflow answers again: "
+                f"python -m services.tracking flush {self._folder}"
+            )
+        return not left
+
+    def _troubled(self) -> bool:
+        return self._failed or self._delivery.slow
+
+    def _work(self) -> None:
+        try:
+            while not self._delivered(closing=self._closing.wait(LINGER_SECONDS)):
+                pass
+        finally:
+            self._delivery.close()
+
+    def _delivered(self, *, closing: bool) -> bool:
+        """Deliver what there is, and return whether it is time to end."""
+        try:
+            self._delivery.deliver()
+        except Exception as error:  # noqa: BLE001  whatever MLflow raises, training goes on
+            self._failed = True
+            if not self._complained:
+                self._complained = True
+                logger.warning(
+                    f"MLflow at {self.uri} does not take records ({in_words(error)}); training goes on, "
+                    f"records wait in {self._spool.path}"
+                )
+            if not closing:
+                self._closing.wait(RETRY_SECONDS)
+            return closing
+        self._failed = False
+        return closing
+
+
+def introduce(tracker: Tracker, config: ExperimentConfig) -> None:
+    """Record what a run is: every setting, the commit of the code and the versions of the libraries."""
+    tracker.parameters(dict(_flat(config.model_dump(mode="json"), "")))
+    tracker.tags({"suite": config.suite.name, "method": config.method.name, "seed": str(config.seed)})
+    tracker.tags({"shots": " ".join(map(str, config.evaluation.shots))})
+    tracker.tags({"git_commit": git_commit(), **{f"version.{name}": v for name, v in library_versions().items()}})
+
+
+def _flat(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _now() -> int:
+    return int(time.time() * 1000)
