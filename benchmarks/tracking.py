@@ -109,7 +109,7 @@ class Run:
             folder.mkdir()
             os.environ["MLFLOW_TRACKING_URI"] = uri
             self.tracker = Tracker(folder, "benchmark")
-            self.tracker.identify()
+            self.tracker.wait_for_run_id()
 
     def go_on(self, count: int) -> None:
         """Do the next iterations and track them, as an experiment does."""

@@ -22,7 +22,7 @@ from services.distributed.cluster import joined
 from services.distributed.node_info import NodeFacts, cluster_facts, facts
 from services.storage.files import DiskFullError, write_file
 from services.tracking.delivery import set_mlflow_defaults
-from services.tracking.links import in_words, redacted, tracking_uri
+from services.tracking.links import error_line, redacted, tracking_uri
 
 Verdict = Literal["good", "warning", "bad"]
 DISK_BYTES = 2 * 10**9
@@ -189,7 +189,7 @@ def _mlflow() -> Finding:
         client.delete_run(run_id)
     except Exception as error:  # noqa: BLE001  whatever MLflow raises is told
         return Finding(
-            "MLflow", "bad", f"{redacted(uri)}: {in_words(error)}",
+            "MLflow", "bad", f"{redacted(uri)}: {error_line(error)}",
             "start it, or mend MLFLOW_TRACKING_URI; a run would go on without, and keep its records",
         )  # fmt: skip
     return Finding("MLflow", "good", f"{redacted(uri)}: takes records")

@@ -30,7 +30,7 @@ from services.storage.remote import STORAGE
 from services.storage.replication import replicated, restored
 from services.storage.run_folders import find_folder, new_folder
 from services.tracking.system import recording_system
-from services.tracking.tracker import Tracker, introduce
+from services.tracking.tracker import Tracker, record_settings
 
 CHANGEABLE = {"iterations", "checkpoint_every", "checkpoints_kept"}
 """Settings of meta-training that a resumed run may change without becoming another run."""
@@ -93,7 +93,7 @@ def _carry_out(given: Arguments, folder: Path, checkpoint: Checkpoint | None) ->
     tracker = Tracker(folder, f"dmil-{config.suite.name}")
     status = "FAILED"
     try:
-        introduce(tracker, config)
+        record_settings(tracker, config)
         with recording_system(tracker), open_runner(given.runner, experiment.suite, given.workers) as runner:
             clock.lap("start")
             data = experiment.collect(runner)
@@ -125,7 +125,7 @@ def _carry_out(given: Arguments, folder: Path, checkpoint: Checkpoint | None) ->
         raise
     finally:
         tracker.close(status)
-    show(summary, tracker.whereabouts)
+    show(summary, tracker.address_lines)
 
 
 def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]:

@@ -67,12 +67,12 @@ def run(arguments: Sequence[str]) -> None:
     tracker = Tracker(sweep.path, f"dmil-{sweep.record.name}")
     status = "FAILED"
     try:
-        _introduce(tracker, sweep)
+        _record_settings(tracker, sweep)
         with recording_system(tracker), joined():
             clock.lap("start")
             _collect(sweep)
             clock.lap("collect")
-            tracker.identify()  # trials are its children
+            tracker.wait_for_run_id()  # trials are its children
             from services.sweeps.tuning import tune_trials  # takes seconds to import: not for --help
 
             tune_trials(sweep)
@@ -88,7 +88,7 @@ def run(arguments: Sequence[str]) -> None:
         tracker.close(status)
     show(tables, sweep)
     console.print("seconds: " + ", ".join(f"{phase} {spent:.0f}" for phase, spent in clock.seconds.items()))
-    for line in [*tracker.whereabouts, *_side_by_side(sweep)]:
+    for line in [*tracker.address_lines, *_side_by_side(sweep)]:
         console.print(line, markup=False, soft_wrap=True)
     if failed := [name for name in sweep.trials if (result := sweep.result(name)) and result.status == "failed"]:
         raise RunError(
@@ -153,7 +153,7 @@ def _resumed(given: Arguments) -> SweepFolder:
     return SweepFolder(find_folder(given.resume, given.runs, MARK))
 
 
-def _introduce(tracker: Tracker, sweep: SweepFolder) -> None:
+def _record_settings(tracker: Tracker, sweep: SweepFolder) -> None:
     record, settings = sweep.record, sweep.record.sweep
     suites, seeds = " ".join(settings.suites), " ".join(map(str, settings.seeds))
     methods = " ".join(dict.fromkeys(trial.config.method.name for trial in sweep.trials.values()))

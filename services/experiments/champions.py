@@ -19,7 +19,7 @@ from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoint
 from services.suites.registry import open_suite
 from services.tracking.delivery import IDENTITY, Identity, set_mlflow_defaults
-from services.tracking.links import in_words, redacted, tracking_uri
+from services.tracking.links import error_line, redacted, tracking_uri
 from services.tracking.models import CHECKPOINT_TAG, checkpoint_in, models_of
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def _asking(uri: str) -> Iterator[None]:
     except Exception as error:  # noqa: BLE001  MLflow and what is below it raise many kinds
         raise RunError(
             f"--promote: MLflow at {redacted(uri)} does not answer as one with a registry of models: "
-            f"{in_words(error)}; wanted the MLflow that the run was tracked by; set MLFLOW_TRACKING_URI to it"
+            f"{error_line(error)}; wanted the MLflow that the run was tracked by; set MLFLOW_TRACKING_URI to it"
         ) from None  # its text may hold secrets
 
 

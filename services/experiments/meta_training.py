@@ -80,7 +80,7 @@ class CheckpointWriter:
                 "iteration": state.iteration,
                 "loss": float(np.mean(self._losses)) if self._losses else None,
                 "environment_steps": self._environment_steps,
-                "mlflow_run_id": self._tracker.identify(patience=RUN_ID_SECONDS if is_last else 0.0),
+                "mlflow_run_id": self._tracker.wait_for_run_id(timeout=RUN_ID_SECONDS if is_last else 0.0),
             }
         )
         self._path = self._checkpoints.save(state, self._constants, self.manifest, self._needed())

@@ -34,7 +34,7 @@ def publish(tracker: Tracker, summary: Summary, folder: Path) -> None:
         tracker.artifact(path, destination)
 
 
-def show(summary: Summary, whereabouts: Sequence[str] = ()) -> None:
+def show(summary: Summary, addresses: Sequence[str] = ()) -> None:
     """Print the table, the use of sub-skills, the seconds, and where everything is, the MLflow run too if given."""
     console.print(table(summary))
     for split, use in summary.sub_skills.items():
@@ -52,5 +52,5 @@ def show(summary: Summary, whereabouts: Sequence[str] = ()) -> None:
     console.print("seconds: " + ", ".join(f"{phase} {spent:.0f}" for phase, spent in summary.seconds.items()))
     page = Path(summary.report) / PAGE
     console.print(f"checkpoint: {summary.checkpoint}\nreport: {page if page.exists() else summary.report}")
-    for line in whereabouts:
+    for line in addresses:
         console.print(line, markup=False, soft_wrap=True)

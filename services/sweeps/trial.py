@@ -27,7 +27,7 @@ from services.storage.replication import replicated
 from services.sweeps.folders import TRAINED, SweepFolder, TrialResult, evaluated, trained
 from services.sweeps.settings import PlannedTrial
 from services.tracking.history import read_metrics
-from services.tracking.tracker import Tracker, introduce
+from services.tracking.tracker import Tracker, record_settings
 
 logger = logging.getLogger(__name__)
 
@@ -87,7 +87,7 @@ def run_trial(folder: Path, name: str, demonstrations: Path, environment: Mappin
     log_file = (sweep.of_trial(name) / "log.txt").open("a", buffering=1)
     with log_file as log, redirect_stdout(log), console_logging(quiet=False):
         try:
-            introduce(tracker, trial.config)
+            record_settings(tracker, trial.config)
             tracker.tags({"sweep": sweep.record.name, "variant": trial.variant, "scale": sweep.record.preset})
             sweep.finish(name, _run(sweep, trial, DemoStore(demonstrations, given_storage()), tracker))
             status = "FINISHED"

@@ -17,7 +17,7 @@ from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.storage.run_folders import find_folder
 from services.tracking.delivery import Delivery
-from services.tracking.links import in_words, redacted, tracking_uri
+from services.tracking.links import error_line, redacted, tracking_uri
 from services.tracking.spool import Artifact, Spool
 
 REPORT = "report"
@@ -66,7 +66,7 @@ def _flush(delivery: Delivery, folder: Path, uri: str) -> None:
         raise
     except Exception as error:  # noqa: BLE001  MLflow and what is below it raise many kinds
         raise RunError(
-            f"MLflow at {redacted(uri)} does not take records: {in_words(error)}; {delivery.delivered - before} of "
+            f"MLflow at {redacted(uri)} does not take records: {error_line(error)}; {delivery.delivered - before} of "
             f"{waiting} were delivered, the others wait in {folder / 'tracking.jsonl'}; set MLFLOW_TRACKING_URI to "
             "the MLflow that the run began with, and flush again"
         ) from None  # its text may hold secrets

@@ -27,7 +27,7 @@ def redacted(text: str) -> str:
     return re.sub(r"(?i)((?:password|passwd|token|secret|key)=)[^&\s'\"]+", r"\1...", text)
 
 
-def in_words(error: Exception) -> str:
+def error_line(error: Exception) -> str:
     """Return an error of MLflow, or of what is below it, in one line without secrets."""
     text = redacted(" ".join(str(error).split()))
     return text if isinstance(error, UserError | RunError) else f"{type(error).__name__}: {text[:200]}"

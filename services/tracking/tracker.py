@@ -12,7 +12,7 @@ from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import RunError
 from services.storage.provenance import git_commit, library_versions
 from services.tracking.delivery import Delivery, Identity
-from services.tracking.links import how_to_look, in_words, redacted, run_link, tracking_uri
+from services.tracking.links import error_line, how_to_look, redacted, run_link, tracking_uri
 from services.tracking.packing import packed
 from services.tracking.spool import Artifact, Ended, Example, Measured, Spool, Trained
 
@@ -26,7 +26,7 @@ SYSTEM = "system/"
 DIGITS = 12
 """Of a data set's digest, in a tag."""
 EXAMPLE_STEPS = 3
-FAREWELL_SECONDS = 3.0
+CLOSING_SECONDS = 3.0
 """How long the end of a run waits for an MLflow that has failed or been slow."""
 
 
@@ -67,7 +67,7 @@ class Tracker:
         return self._delivery.run_id
 
     @property
-    def whereabouts(self) -> list[str]:
+    def address_lines(self) -> list[str]:
         """Lines that say where the MLflow run is, as far as it is known, and how to look at it."""
         run_id, experiment_id, uri = self.run_id, self._delivery.experiment_id, tracking_uri()
         lines = [f"MLflow run: {run_id or 'not there yet'} at {self.uri}"]
@@ -133,25 +133,25 @@ class Tracker:
         example = Example.model_validate(packed(parts, parts[0].observations[0]))
         self._spool.append("model", Trained(checkpoint=str(below), example=example))
 
-    def identify(self, patience: float = 20.0) -> str | None:
+    def wait_for_run_id(self, timeout: float = 20.0) -> str | None:
         """Return the MLflow run's id, or None if it is not known yet.
 
         Args:
-            patience: seconds, counted from the tracker's opening, to wait for it while MLflow neither fails nor is
+            timeout: seconds, counted from the tracker's opening, to wait for it while MLflow neither fails nor is
                 slow; 0 does not wait.
         """
-        while self.run_id is None and not self._troubled() and time.monotonic() < self._opened + patience:
+        while self.run_id is None and not self._troubled() and time.monotonic() < self._opened + timeout:
             time.sleep(0.02)
         return self.run_id
 
-    def close(self, status: str, patience: float = 60.0) -> bool:
+    def close(self, status: str, timeout: float = 60.0) -> bool:
         """End the MLflow run; return whether all records have been delivered, and say so if not.
 
         It raises nothing, so as not to hide what ended the run.
 
         Args:
             status: how the run ended: FINISHED, FAILED or KILLED.
-            patience: seconds to wait for the delivery while MLflow neither fails nor is slow.
+            timeout: seconds to wait for the delivery while MLflow neither fails nor is slow.
         """
         try:
             self._spool.append("end", Ended.model_validate({"status": status, "time": _now()}))
@@ -159,10 +159,10 @@ class Tracker:
             logger.warning(f"the end of the run is not recorded: {error}")
         self._closing.set()
         started = time.monotonic()
-        while self._thread.is_alive() and time.monotonic() < started + patience:
+        while self._thread.is_alive() and time.monotonic() < started + timeout:
             self._thread.join(0.05)
             if self._troubled():
-                patience = min(patience, FAREWELL_SECONDS)
+                timeout = min(timeout, CLOSING_SECONDS)
         self._spool.close()
         left = self.waiting
         if left:
@@ -191,7 +191,7 @@ class Tracker:
             if not self._complained:
                 self._complained = True
                 logger.warning(
-                    f"MLflow at {self.uri} does not take records ({in_words(error)}); training goes on, "
+                    f"MLflow at {self.uri} does not take records ({error_line(error)}); training goes on, "
                     f"records wait in {self._spool.path}"
                 )
             if not closing:
@@ -201,7 +201,7 @@ class Tracker:
         return closing
 
 
-def introduce(tracker: Tracker, config: ExperimentConfig) -> None:
+def record_settings(tracker: Tracker, config: ExperimentConfig) -> None:
     """Record what a run is: every setting, the commit of the code and the versions of the libraries."""
     tracker.parameters(dict(_flat(config.model_dump(mode="json"), "")))
     tracker.tags({"suite": config.suite.name, "method": config.method.name, "seed": str(config.seed)})

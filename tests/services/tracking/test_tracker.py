@@ -123,8 +123,8 @@ def test_a_slow_server_is_not_waited_for(
     tracker = Tracker(tmp_path, "slow")
     for step in range(1, 101):
         tracker.metrics(step, {"loss": 1 / step})
-        tracker.identify(patience=0)
-    assert tracker.identify() is None
+        tracker.wait_for_run_id(timeout=0)
+    assert tracker.wait_for_run_id() is None
     assert not tracker.close("FINISHED")
     slow_server[1].set()
     tracker._thread.join()
@@ -183,7 +183,7 @@ def test_a_server_takes_records_also_those_of_the_time_it_was_away(server: Serve
     tracker = Tracker(folder, "an experiment")
     tracker.parameters({f"setting.{number}": number for number in range(150)})
     tracker.metrics(1, {"loss": 0.5})
-    run_id = tracker.identify()
+    run_id = tracker.wait_for_run_id()
     assert run_id is not None
     wait_for(lambda: client.get_run(run_id).data.metrics == {"loss": 0.5}, "the first metric")
 
