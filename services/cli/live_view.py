@@ -28,7 +28,7 @@ class Workers(NamedTuple):
 
 
 class Tally(NamedTuple):
-    """What an evaluation has found of one split and size of support set."""
+    """The successes of an evaluation so far, for one split and size of support set."""
 
     split: str
     shots: int
@@ -36,7 +36,7 @@ class Tally(NamedTuple):
     episodes: int
 
     @property
-    def in_words(self) -> str:
+    def line(self) -> str:
         """Its rate, with the counts behind it."""
         return f"{self.shots}-shot {self.successes / self.episodes:.3f} ({self.successes}/{self.episodes})"
 
@@ -58,7 +58,7 @@ class Pace(NamedTuple):
         return f"{_clock((self.total - self.done) / self.rate)} left" if self.rate and self.done < self.total else ""
 
     @property
-    def in_words(self) -> str:
+    def line(self) -> str:
         """How fast it goes, what it took, and what it will still take."""
         return ", ".join(filter(None, [self.speed, f"{_clock(self.seconds)} so far", self.left]))
 
@@ -68,8 +68,8 @@ class Pace(NamedTuple):
         return f"{self.rate:.3g} {self.unit}/s" if self.rate and self.unit else ""
 
 
-class Figures(NamedTuple):
-    """What is told of a phase beside how far it is; what it has none of is left out."""
+class Status(NamedTuple):
+    """What is shown of a phase besides its pace; fields without a value are left out."""
 
     losses: Mapping[str, float] = {}
     """By their names among the metrics."""
@@ -77,7 +77,7 @@ class Figures(NamedTuple):
     """Of the states, the part that each sub-skill takes."""
     success: Sequence[Tally] = ()
     after: int | None = None
-    """The iterations after which that was found."""
+    """The iterations after which that was measured."""
     workers: Sequence[Workers] = ()
     at: str = ""
     """What is at work."""
@@ -92,7 +92,7 @@ class Figures(NamedTuple):
         if self.success:
             when = "" if self.after is None else f"after {self.after}"
             for split in dict.fromkeys(tally.split for tally in self.success):
-                tallies = [tally.in_words for tally in self.success if tally.split == split]
+                tallies = [tally.line for tally in self.success if tally.split == split]
                 yield "success", _packed([f"{split} {tallies[0]}", *tallies[1:], when], width)
                 when = ""
         if self.workers:
@@ -101,7 +101,7 @@ class Figures(NamedTuple):
             yield "at", _packed(self.at.split("; "), width)
 
     @property
-    def in_words(self) -> str:
+    def line(self) -> str:
         """The same in a line."""
         used = sum(share > NEAR for share in self.shares)
         restarted = sum(workers.restarted for workers in self.workers)
@@ -110,7 +110,7 @@ class Figures(NamedTuple):
                 *([f"loss {_short(self.losses['loss'])}"] if "loss" in self.losses else []),
                 *([f"sub-skills in use {used}/{len(self.shares)}"] if len(self.shares) > 1 else []),
                 *([f"after {self.after}"] if self.success and self.after is not None else []),
-                *(f"{tally.split} {tally.in_words}" for tally in self.success),
+                *(f"{tally.split} {tally.line}" for tally in self.success),
                 *([f"workers restarted {restarted}"] if restarted else []),
                 *([self.at] if self.at else []),
             ]
@@ -122,7 +122,7 @@ class Screen(NamedTuple):
 
     name: str
     pace: Pace
-    figures: Figures
+    status: Status
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Lay it out for the terminal's width."""
@@ -137,9 +137,9 @@ class Screen(NamedTuple):
         bar.add_column(no_wrap=True)
         bar.add_row(ProgressBar(total=max(self.pace.total, 1), completed=self.pace.done), count)
         grid.add_row(self.name, bar)
-        grid.add_row("", self.pace.in_words)
+        grid.add_row("", self.pace.line)
         before = None
-        for label, content in self.figures.rows(width - LABEL - 1):
+        for label, content in self.status.rows(width - LABEL - 1):
             grid.add_row("" if label == before else label, content)
             before = label
         yield grid

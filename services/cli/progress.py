@@ -11,7 +11,7 @@ from types import TracebackType
 from rich.console import Console
 from rich.live import Live
 
-from services.cli.live_view import Figures, Pace, Screen
+from services.cli.live_view import Pace, Screen, Status
 
 LINE_SECONDS = 5.0
 REFRESHES = 2
@@ -67,7 +67,7 @@ class Bar:
     """The progress of one phase, to be used in a ``with``."""
 
     def __init__(
-        self, name: str, total: int, done: int = 0, unit: str = "", figures: Callable[[], Figures] | None = None
+        self, name: str, total: int, done: int = 0, unit: str = "", status: Callable[[], Status] | None = None
     ) -> None:
         """Show `done` of `total`.
 
@@ -76,16 +76,16 @@ class Bar:
             total: how much there is to do.
             done: of it.
             unit: what is counted, where its rate is of interest.
-            figures: gives what else is to be shown, whenever it is, from another thread.
+            status: returns what else to show; it is called from another thread.
         """
         self._name, self._total, self._done, self._unit, self._text = name, total, done, unit, ""
-        self._figures = figures or (lambda: Figures(at=self._text))
+        self._status = status or (lambda: Status(at=self._text))
         self._started, self._line_at, self._told = time.monotonic(), 0.0, -1
         self._seen = deque([(self._started, done)])
         self._live: Live | None = None
 
     def advance(self, steps: int, text: str = "") -> None:
-        """Count `steps` more, and show `text` beside if there are no figures."""
+        """Count `steps` more, and show `text` beside if there is no status."""
         self._done += steps
         self._text = text
         if self._live is None and (time.monotonic() - self._line_at >= LINE_SECONDS or self._done == self._total):
@@ -101,12 +101,12 @@ class Bar:
         return Pace(self._done, self._total, now - self._started, rate, self._unit)
 
     def _screen(self) -> Screen:
-        return Screen(self._name, self._pace(), self._figures())
+        return Screen(self._name, self._pace(), self._status())
 
     def _line(self) -> None:
         self._line_at, self._told = time.monotonic(), self._done
         pace = self._pace()
-        parts = [f"{self._name} {pace.done}/{pace.total}, {pace.in_words}", self._figures().in_words]
+        parts = [f"{self._name} {pace.done}/{pace.total}, {pace.line}", self._status().line]
         console.print("; ".join(filter(None, parts)), markup=False)
 
     def __enter__(self) -> "Bar":

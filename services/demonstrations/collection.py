@@ -6,7 +6,7 @@ from contextlib import closing
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import DemonstrationError
-from services.cli.live_view import Figures
+from services.cli.live_view import Status
 from services.cli.progress import Bar
 from services.demonstrations.external import check_dimensions, demonstrations, places_of
 from services.demonstrations.store import DemoStore, TaskDemonstrations
@@ -125,10 +125,10 @@ class DemonstrationCollection:
 
         at = ""
 
-        def figures() -> Figures:
-            return Figures(workers=runner.worker_counts, at=at)
+        def status() -> Status:
+            return Status(workers=runner.worker_counts, at=at)
 
-        with Bar("collecting", len(tasks) * settings.per_task, 0, "demonstrations", figures) as bar:
+        with Bar("collecting", len(tasks) * settings.per_task, 0, "demonstrations", status) as bar:
             while attempts:
                 items: list[ExpertAttempts] = []
                 for task in attempts:

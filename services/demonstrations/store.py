@@ -187,7 +187,7 @@ class DemoStore:
         if self._storage is None:
             return False
         try:
-            return self._storage.get_sealed(f"data/{dataset_id}", self.root / dataset_id, FILES, DIGESTS)
+            return self._storage.get_folder(f"data/{dataset_id}", self.root / dataset_id, FILES, DIGESTS)
         except Exception as error:  # noqa: BLE001  whatever a storage raises, demonstrations can be made again
             console.print(f"warning: {self._storage.url} gives no {dataset_id}: {error}", markup=False)
             return False
@@ -198,7 +198,7 @@ class DemoStore:
             return
         contents = {file: (self.root / dataset_id / file).read_bytes() for file in (*FILES, DIGESTS)}
         try:
-            self._storage.put_sealed(f"data/{dataset_id}", contents, DIGESTS)
+            self._storage.put_folder(f"data/{dataset_id}", contents, DIGESTS)
         except Exception as error:  # noqa: BLE001  whatever a storage raises, they are here
             console.print(f"warning: {self._storage.url} does not take {dataset_id}: {error}", markup=False)
 

@@ -167,7 +167,7 @@ class Evaluations:
         self._overlap = overlap
         self._under_way: tuple[Checkpoint, Simulation[AdaptationOutcome]] | None = None
         self.latest: dict[str, Any] = {}
-        """What the last one came to, as fields of `Figures`: the ``success``, and ``after`` how many iterations."""
+        """What the last one came to, as fields of `Status`: the ``success``, and ``after`` how many iterations."""
 
     def is_due(self, iteration: int) -> bool:
         """Tell whether the checkpoint of an iteration is evaluated on the way; the last one is when all is over."""

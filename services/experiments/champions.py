@@ -159,7 +159,7 @@ class Contest:
             if self.rival is None:
                 return [f"{name}: version {version} is the {ALIAS} already"]
             pairs = self._pairs(evaluation, folder, version)
-            lines = [_in_words(pair) for pair in pairs]
+            lines = [_describe(pair) for pair in pairs]
             if not is_better(pairs):
                 return [*lines, f"{name}: the {ALIAS} stays version {champion.version}; version {version} is no better"]
             self.client.set_registered_model_alias(name, ALIAS, version)
@@ -217,7 +217,7 @@ def is_better(pairs: Sequence[Difference | Unpaired]) -> bool:
     return "yes, higher" in answers and "yes, lower" not in answers
 
 
-def _in_words(pair: Difference | Unpaired) -> str:
+def _describe(pair: Difference | Unpaired) -> str:
     where = f"{pair.row} against {pair.baseline}, {pair.split} {pair.shots}-shot"
     if isinstance(pair, Unpaired):
         return f"{where}: not compared: {pair.why}"

@@ -13,7 +13,7 @@ from dmil_core.methods.registry import method_type
 from dmil_core.networks import Parameters, flatten
 from dmil_core.outer_loop import OuterState
 from dmil_core.seeding import named_rng
-from services.cli.live_view import Figures
+from services.cli.live_view import Status
 from services.cli.progress import Bar
 from services.demonstrations.collection import DemonstrationCollection
 from services.demonstrations.store import DemoStore, TaskDemonstrations
@@ -203,11 +203,11 @@ class Experiment:
         outcomes: dict[int, AdaptationOutcome] = {}
         tallies, at = Tallies(runner.meter), ""
 
-        def figures() -> Figures:
-            return Figures(success=list(tallies), workers=runner.worker_counts, at=at)
+        def status() -> Status:
+            return Status(success=list(tallies), workers=runner.worker_counts, at=at)
 
         with (
-            Bar("evaluating", sum(len(each.episodes) for each in evaluator.adaptations), 0, "episodes", figures) as bar,
+            Bar("evaluating", sum(len(each.episodes) for each in evaluator.adaptations), 0, "episodes", status) as bar,
             keeping_failures(folder, self.config, lambda: checkpoint.path),
         ):
             for index, outcome in runner.simulate(evaluator.items(checkpoint, AdaptationRollouts)):

@@ -1,16 +1,16 @@
-"""What is told of an iteration: the metrics that are tracked, and the figures on the screen."""
+"""An iteration in numbers and words: the metrics that are tracked, and the status on the screen."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from dmil_core.statistics import share_entropy
-from services.cli.live_view import Figures
+from services.cli.live_view import Status
 from services.distributed.runner import Iteration
 
 
 def iteration_metrics(iteration: Iteration) -> dict[str, float]:
-    """Return an iteration's metrics: the means over its slots, what they say together, and how fast it went."""
+    """Return an iteration's metrics: the means over its slots, their entropy, and its speed."""
     metrics = {name: float(np.mean([slot[name] for slot in iteration.slots])) for name in iteration.slots[0]}
     if "environment_steps" in metrics:
         metrics["environment_steps"] *= len(iteration.slots)
@@ -28,18 +28,18 @@ def shares_of(metrics: Mapping[str, float]) -> np.ndarray:
     return np.array([share for name, share in metrics.items() if name.startswith("sub_skill_share/")])
 
 
-def figures_of(recent: Sequence[Mapping[str, float]]) -> Figures:
+def status_of(recent: Sequence[Mapping[str, float]]) -> Status:
     """Return the losses and the use of sub-skills as means over some iterations' metrics."""
     if not recent:
-        return Figures()
-    told = [name for name in recent[-1] if "loss" in name or name.startswith("sub_skill_share/")]
-    # A method that learns in phases tells other metrics in each.
-    means = {name: float(np.mean([metrics[name] for metrics in recent if name in metrics])) for name in told}
+        return Status()
+    shown = [name for name in recent[-1] if "loss" in name or name.startswith("sub_skill_share/")]
+    # A method that learns in phases has other metrics in each.
+    means = {name: float(np.mean([metrics[name] for metrics in recent if name in metrics])) for name in shown}
     losses = {name: value for name, value in means.items() if "loss" in name}
-    return Figures(losses=losses, shares=shares_of(means).tolist())
+    return Status(losses=losses, shares=shares_of(means).tolist())
 
 
-def nonfinite_in_words(iteration: Iteration) -> str:
+def nonfinite_message(iteration: Iteration) -> str:
     """Return which slots of an iteration have a loss or a gradient that is not finite."""
     slots = "; ".join(
         f"slot {slot.slot}, task {slot.task}, demonstrations {', '.join(dict.fromkeys(slot.demonstrations))}"

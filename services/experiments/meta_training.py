@@ -11,14 +11,14 @@ import numpy as np
 
 from dmil_core.errors import RunError
 from dmil_core.outer_loop import OuterState
-from services.cli.live_view import Figures
+from services.cli.live_view import Status
 from services.cli.progress import Bar
 from services.distributed.failures import keeping_failures
 from services.distributed.metrics import CHECKPOINT_TIME, SPOOL_RECORDS
 from services.distributed.runner import Plan, Runner
 from services.evaluation.evaluator import Evaluations
 from services.evaluation.summary import AGAINST_COLLAPSE, COLLAPSED
-from services.experiments.iteration_metrics import figures_of, iteration_metrics, nonfinite_in_words, shares_of
+from services.experiments.iteration_metrics import iteration_metrics, nonfinite_message, shares_of, status_of
 from services.storage.checkpoints import Checkpoint, Checkpoints, Manifest
 from services.tracking.tracker import Tracker
 
@@ -135,9 +135,9 @@ class IterationLog:
             logger.warning(warning)
             self._tracker.tags({"warning.collapse": warning})
 
-    def figures(self) -> Figures:
+    def status(self) -> Status:
         """Return what the screen shows."""
-        return figures_of(list(self._recent))._replace(**self._evaluations.latest, workers=self._runner.worker_counts)
+        return status_of(list(self._recent))._replace(**self._evaluations.latest, workers=self._runner.worker_counts)
 
 
 def meta_train(
@@ -159,14 +159,14 @@ def meta_train(
         try:
             runner.meter.record(CHECKPOINT_TIME, time.time())
             with (
-                Bar("meta-training", total, plan.state.iteration, "iterations", log.figures) as bar,
+                Bar("meta-training", total, plan.state.iteration, "iterations", log.status) as bar,
                 keeping_failures(writer.folder, writer.manifest.config, write),
             ):
                 for iteration in training.iterations(total - plan.state.iteration):
                     metrics = iteration_metrics(iteration)
                     writer.add(metrics, stepped=iteration.stepped)
                     if not iteration.stepped:
-                        problem = nonfinite_in_words(iteration)
+                        problem = nonfinite_message(iteration)
                         if not plan.skip_nonfinite:
                             write()
                             raise _nonfinite_error(problem, writer.folder)

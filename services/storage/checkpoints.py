@@ -26,7 +26,7 @@ from services.storage.files import inside, read_file, room_for, sync
 
 logger = logging.getLogger(__name__)
 
-MANIFEST, SEAL = "manifest.json", "manifest.sha256"
+MANIFEST, MARKER = "manifest.json", "manifest.sha256"
 PARAMETERS, OPTIMISER, CONSTANTS = "parameters.safetensors", "optimiser.safetensors", "constants.safetensors"
 MOST_MANIFEST = 2**22
 """Bytes of a manifest."""
@@ -42,7 +42,7 @@ FILES = {
     CONSTANTS: MOST_CONSTANTS,
     MANIFEST: MOST_MANIFEST,
 }
-"""What a checkpoint has besides its seal, and the most bytes of each."""
+"""What a checkpoint has besides its marker, and the most bytes of each."""
 
 Side = Annotated[int, Field(ge=1, le=MOST_TENSORS)]
 Shape = Annotated[tuple[Side, ...], Field(min_length=1, max_length=8)]
@@ -131,7 +131,7 @@ class Checkpoint:
         try:
             tensors = load(checked_file(self.path, name, self.manifest.files.get(name), most))
         except OSError as error:
-            raise self._damaged(name, _in_words(error), "what its digest in the manifest says") from error
+            raise self._damaged(name, _describe(error), "what its digest in the manifest says") from error
         except (SafetensorError, KeyError, ValueError, TypeError, OverflowError) as error:  # KeyError: an odd dtype
             raise self._damaged(name, f"{type(error).__name__}, {str(error)[:200]}", "safetensors") from error
         if odd := [key for key, tensor in tensors.items() if tensor.dtype != np.float32]:
@@ -240,7 +240,7 @@ class Checkpoints:
         }
         digests = {name: sha256(content) for name, content in files.items()}
         text = json.dumps({**manifest.model_dump(mode="json"), "files": digests}, indent=1).encode()
-        files |= {MANIFEST: text, SEAL: listing({MANIFEST: sha256(text)}).encode()}
+        files |= {MANIFEST: text, MARKER: listing({MANIFEST: sha256(text)}).encode()}
         for abandoned in self.folder.glob(".writing-*"):  # by a writer that was killed
             shutil.rmtree(abandoned)
         try:
@@ -289,11 +289,11 @@ def _read_manifest(path: Path) -> Manifest:
     """
     try:
         text = read_file(inside(path, MANIFEST), MOST_MANIFEST)
-        if read_file(inside(path, SEAL), 200).decode("ascii", "replace") != listing({MANIFEST: sha256(text)}):
-            raise OSError(f"a file whose SHA-256 is not the one in {SEAL}")
+        if read_file(inside(path, MARKER), 200).decode("ascii", "replace") != listing({MANIFEST: sha256(text)}):
+            raise OSError(f"a file whose SHA-256 is not the one in {MARKER}")
         manifest = Manifest.model_validate_json(text)
     except (OSError, ValidationError) as error:
-        got = _in_words(error) if isinstance(error, OSError) else "; ".join(explain(error, "manifest").splitlines())
+        got = _describe(error) if isinstance(error, OSError) else "; ".join(explain(error, "manifest").splitlines())
         raise CheckpointError(
             f"{path / MANIFEST}: got {got}; wanted a checkpoint's manifest; use another checkpoint"
         ) from error
@@ -304,5 +304,5 @@ def _read_manifest(path: Path) -> Manifest:
     return manifest
 
 
-def _in_words(error: OSError) -> str:
+def _describe(error: OSError) -> str:
     return f"{error.strerror} ({error.filename})" if error.filename else str(error)

@@ -1,7 +1,7 @@
 """A place that all machines reach, named by a URL of fsspec, as ``s3://bucket/folder``.
 
-There a folder is whole or not at all, without a rename: the file that vouches for the others, its seal, comes last and
-goes first. So whoever was killed between two parts leaves nothing that anybody takes.
+There a folder is whole or not at all, without a rename: its commit marker, a file that vouches for the others, is
+written last and removed first. So a writer that is killed between two files leaves nothing that anybody reads.
 """
 
 import os
@@ -58,25 +58,25 @@ class Storage:
         except FileNotFoundError:
             return None
 
-    def put_sealed(self, name: str, contents: Mapping[str, bytes], seal: str) -> None:
-        """Write a folder's files, the seal last; a folder of that name which is there is none until then."""
-        self.remove(name, seal)
-        for file in sorted(contents, key=lambda file: file == seal):
+    def put_folder(self, name: str, contents: Mapping[str, bytes], marker: str) -> None:
+        """Write a folder's files, the marker last; a folder of that name which is there is none until then."""
+        self.remove(name, marker)
+        for file in sorted(contents, key=lambda file: file == marker):
             self.put(f"{name}/{file}", contents[file])
 
-    def get_sealed(self, name: str, folder: Path, files: Mapping[str, int], seal: str) -> bool:
-        """Fetch a folder whose seal is there, and return whether it was; who reads it checks it.
+    def get_folder(self, name: str, folder: Path, files: Mapping[str, int], marker: str) -> bool:
+        """Fetch a folder whose marker is there, and return whether it was; who reads it checks it.
 
         Args:
             name: of the folder here.
             folder: where it goes; it is made by a rename, unless it is there by then.
-            files: what is in it besides the seal, and how many bytes each may have at most.
-            seal: the name of the file that vouches for them.
+            files: what is in it besides the marker, and how many bytes each may have at most.
+            marker: the name of the file that vouches for them.
 
         Raises:
-            RunError: for a file that is too large, or missing although the seal is there.
+            RunError: for a file that is too large, or missing although the marker is there.
         """
-        content = self.get(f"{name}/{seal}", 2**20)
+        content = self.get(f"{name}/{marker}", 2**20)
         if content is None:
             return False
         beside = folder.with_name(f".fetching-{os.getpid()}-{folder.name}")
@@ -84,29 +84,29 @@ class Storage:
             for file, most in files.items():
                 part = self.get(f"{name}/{file}", most)
                 if part is None:
-                    raise RunError(f"{self.url}/{name}/{file}: got nothing; wanted what its {seal} vouches for")
+                    raise RunError(f"{self.url}/{name}/{file}: got nothing; wanted what its {marker} vouches for")
                 (beside / file).parent.mkdir(parents=True, exist_ok=True)
                 (beside / file).write_bytes(part)
-            (beside / seal).write_bytes(content)
+            (beside / marker).write_bytes(content)
             if not folder.exists():
                 beside.replace(folder)
         finally:
             shutil.rmtree(beside, ignore_errors=True)
         return True
 
-    def sealed(self, name: str, seal: str, pattern: str) -> dict[str, bytes]:
-        """Return the seals of the folders in a folder whose names match a pattern, by name, in order."""
+    def committed(self, name: str, marker: str, pattern: str) -> dict[str, bytes]:
+        """Return the markers of the folders in a folder whose names match a pattern, by name, in order."""
         try:
             listed = self._files.ls(self._path(name), detail=False)
         except FileNotFoundError:
             return {}
         names = sorted(path.rstrip("/").rpartition("/")[2] for path in listed)
-        seals = {own: self.get(f"{name}/{own}/{seal}", 2**20) for own in names if re.fullmatch(pattern, own)}
-        return {own: content for own, content in seals.items() if content is not None}
+        markers = {own: self.get(f"{name}/{own}/{marker}", 2**20) for own in names if re.fullmatch(pattern, own)}
+        return {own: content for own, content in markers.items() if content is not None}
 
-    def remove(self, name: str, seal: str) -> None:
-        """Remove a folder, its seal first."""
-        for path in (f"{name}/{seal}", name):
+    def remove(self, name: str, marker: str) -> None:
+        """Remove a folder, its marker first."""
+        for path in (f"{name}/{marker}", name):
             if self._files.exists(self._path(path)):
                 self._files.rm(self._path(path), recursive=True)
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from services.storage.checkpoints import FILES, SEAL
+from services.storage.checkpoints import FILES, MARKER
 from services.storage.remote import Storage, given_storage
 
 logger = logging.getLogger(__name__)
@@ -51,19 +51,19 @@ class Replica:
 
     def _copy_checkpoints(self) -> None:
         place = f"{self._name}/checkpoints"
-        there = self._storage.sealed(place, SEAL, NAMED)
-        here = {path.parent.name: path for path in sorted(self._folder.glob(f"checkpoints/iteration-*/{SEAL}"))}
-        for name, seal in here.items():
+        there = self._storage.committed(place, MARKER, NAMED)
+        here = {path.parent.name: path for path in sorted(self._folder.glob(f"checkpoints/iteration-*/{MARKER}"))}
+        for name, marker in here.items():
             try:
-                if there.get(name) == seal.read_bytes():
+                if there.get(name) == marker.read_bytes():
                     continue
-                contents = {file: (seal.parent / file).read_bytes() for file in (*FILES, SEAL)}
+                contents = {file: (marker.parent / file).read_bytes() for file in (*FILES, MARKER)}
             except FileNotFoundError:  # the run has let go of it meanwhile
                 continue
-            self._storage.put_sealed(f"{place}/{name}", contents, SEAL)
+            self._storage.put_folder(f"{place}/{name}", contents, MARKER)
         if here:
             for name in there.keys() - here.keys():
-                self._storage.remove(f"{place}/{name}", SEAL)
+                self._storage.remove(f"{place}/{name}", MARKER)
 
     def restore(self) -> bool:
         """Fetch what the folder lacks; return whether there was anything.
@@ -75,7 +75,7 @@ class Replica:
         """
         place = f"{self._name}/checkpoints"
         here = [path.name for path in self._folder.glob("checkpoints/iteration-*")]
-        newest = max(self._storage.sealed(place, SEAL, NAMED), default="")
+        newest = max(self._storage.committed(place, MARKER, NAMED), default="")
         if (self._folder / "config.json").exists() and newest <= max(here, default=""):
             return False
         found = {name: self._storage.get(f"{self._name}/{name}", MOST_RECORDS) for name in RECORDS}
@@ -85,7 +85,7 @@ class Replica:
         if newest:
             (self._folder / "checkpoints").mkdir(exist_ok=True)
             target = self._folder / "checkpoints" / newest
-            self._storage.get_sealed(f"{place}/{newest}", target, FILES, SEAL)
+            self._storage.get_folder(f"{place}/{newest}", target, FILES, MARKER)
         for name, content in found.items():
             if content is not None:
                 (self._folder / name).write_bytes(content)

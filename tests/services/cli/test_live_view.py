@@ -7,10 +7,10 @@ from rich.console import Console
 from rich.text import Text
 
 from services.cli.colours import COLOURS
-from services.cli.live_view import Figures, Pace, Screen, Strip, Tally, Workers
+from services.cli.live_view import Pace, Screen, Status, Strip, Tally, Workers
 
 LOSSES = {"loss": 0.61, "high_loss_before": 0.34, "high_loss_after": 0.12, "continuity_loss": 0.01}
-FIGURES = Figures(
+STATUS = Status(
     losses=LOSSES,
     shares=(0.5, 0.3, 0.2),
     success=[Tally("meta-training", 1, 45, 60), Tally("meta-training", 3, 50, 60), Tally("meta-testing", 1, 10, 20)],
@@ -34,7 +34,7 @@ def plain(what, width: int) -> list[str]:
 
 @pytest.mark.parametrize("width", [80, 160])
 def test_a_screen_says_all_that_is_known(width: int):
-    lines = plain(Screen("meta-training", PACE, FIGURES), width)
+    lines = plain(Screen("meta-training", PACE, STATUS), width)
     shown = "\n".join(lines)
     for words in (
         "750/2000", "4 iterations/s, 0:03:20 so far, 0:05:12 left",
@@ -52,16 +52,16 @@ def test_a_screen_says_all_that_is_known(width: int):
 
 @pytest.mark.parametrize("width", [1, 5, 16, 30, 79])
 def test_no_terminal_is_too_narrow(width: int):
-    lines = plain(Screen("meta-training", PACE, FIGURES), width)
+    lines = plain(Screen("meta-training", PACE, STATUS), width)
     assert lines
     assert all(len(line) <= width for line in lines)
 
 
 def test_what_is_not_known_is_left_out():
-    lines = plain(Screen("evaluating", Pace(0, 0, 0.0, 0.0, "episodes"), Figures()), 80)
+    lines = plain(Screen("evaluating", Pace(0, 0, 0.0, 0.0, "episodes"), Status()), 80)
     assert [line.split() for line in lines if line.strip()][1:] == [["0:00:00", "so", "far"]]
     assert lines[0].split()[0] == "evaluating"
-    assert Figures().in_words == ""
+    assert Status().line == ""
 
 
 def test_each_sub_skill_has_its_colour_and_its_number():
@@ -82,11 +82,11 @@ def test_a_strip_is_as_wide_as_there_is_room(shares: tuple[float, ...]):
 
 
 def test_a_line_says_it_in_words():
-    assert FIGURES.in_words == (
+    assert STATUS.line == (
         "loss 0.610; sub-skills in use 3/3; after 500; meta-training 1-shot 0.750 (45/60); "
         "meta-training 3-shot 0.833 (50/60); "
         "meta-testing 1-shot 0.500 (10/20); workers restarted 1; door-close"
     )
-    assert Figures(losses={"loss": float("nan")}, shares=[1.0]).in_words == "loss nan"
-    assert PACE.in_words == "4 iterations/s, 0:03:20 so far, 0:05:12 left"
-    assert PACE._replace(done=2000, rate=0.0).in_words == "0:03:20 so far"
+    assert Status(losses={"loss": float("nan")}, shares=[1.0]).line == "loss nan"
+    assert PACE.line == "4 iterations/s, 0:03:20 so far, 0:05:12 left"
+    assert PACE._replace(done=2000, rate=0.0).line == "0:03:20 so far"

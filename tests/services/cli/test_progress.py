@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import pytest
 
-from services.cli.live_view import Figures
+from services.cli.live_view import Status
 from services.cli.progress import Bar, Output
 
 HIDDEN, SHOWN = "\x1b[?25l", "\x1b[?25h"
@@ -133,7 +133,7 @@ def test_steps_are_counted_and_nothing_more(monkeypatch: pytest.MonkeyPatch):
     """What is shown is put together when it is shown."""
     file, asked = StringIO(), []
     monkeypatch.setattr("services.cli.progress.console", Output(file=file, width=160, highlight=False))
-    with Bar("working", 10**5, figures=lambda: asked.append(1) or Figures(at="the work")) as bar:
+    with Bar("working", 10**5, status=lambda: asked.append(1) or Status(at="the work")) as bar:
         for _ in range(10**5):
             bar.advance(1)
     lines = file.getvalue().splitlines()

@@ -18,7 +18,7 @@ from dmil_core.errors import RunError, UserError
 from services import meta_train
 from services.demonstrations.store import DemoStore, open_store
 from services.experiments.experiment import Experiment, open_runner
-from services.storage.checkpoints import FILES, SEAL, Checkpoint, CheckpointError, Checkpoints
+from services.storage.checkpoints import FILES, MARKER, Checkpoint, CheckpointError, Checkpoints
 from services.storage.remote import STORAGE, Storage
 from services.storage.replication import Replica, replicated
 from tests.services.conftest import QUICK_EVALUATION
@@ -57,29 +57,29 @@ def url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Monk
 
 def names(storage: Storage) -> set[str]:
     """Return the seals that are there."""
-    return set(storage.sealed("runs/run/checkpoints", SEAL, r"iteration-\d+"))
+    return set(storage.committed("runs/run/checkpoints", MARKER, r"iteration-\d+"))
 
 
 def test_a_sealed_folder_is_whole_or_not_there(url: str, tmp_path: Path):
     storage = Storage(url)
     assert storage.get("a/b", 10) is None
-    assert storage.sealed("a", "seal", ".*") == {}
-    storage.put_sealed("a/b", {"seal": b"s", "one": b"1", "deep/two": b"22"}, "seal")
-    assert storage.sealed("a", "seal", ".*") == {"b": b"s"}
-    assert storage.sealed("a", "seal", "c") == {}
-    assert storage.get_sealed("a/b", tmp_path / "here", {"one": 1, "deep/two": 2}, "seal")
+    assert storage.committed("a", "seal", ".*") == {}
+    storage.put_folder("a/b", {"seal": b"s", "one": b"1", "deep/two": b"22"}, "seal")
+    assert storage.committed("a", "seal", ".*") == {"b": b"s"}
+    assert storage.committed("a", "seal", "c") == {}
+    assert storage.get_folder("a/b", tmp_path / "here", {"one": 1, "deep/two": 2}, "seal")
     assert (tmp_path / "here" / "deep" / "two").read_bytes() == b"22"
     with pytest.raises(RunError, match="got 2 bytes; wanted at most 1"):
-        storage.get_sealed("a/b", tmp_path / "other", {"deep/two": 1}, "seal")
+        storage.get_folder("a/b", tmp_path / "other", {"deep/two": 1}, "seal")
     with pytest.raises(RunError, match="three: got nothing"):
-        storage.get_sealed("a/b", tmp_path / "other", {"three": 1}, "seal")
+        storage.get_folder("a/b", tmp_path / "other", {"three": 1}, "seal")
     assert {path.name for path in tmp_path.iterdir()} <= {"here", "storage"}
     storage.put("a/c/one", b"unsealed")
-    assert not storage.get_sealed("a/c", tmp_path / "other", {"one": 10}, "seal")
-    assert storage.sealed("a", "seal", ".*") == {"b": b"s"}
+    assert not storage.get_folder("a/c", tmp_path / "other", {"one": 10}, "seal")
+    assert storage.committed("a", "seal", ".*") == {"b": b"s"}
     storage.remove("a/b", "seal")
     storage.remove("a/never", "seal")
-    assert storage.sealed("a", "seal", ".*") == {}
+    assert storage.committed("a", "seal", ".*") == {}
 
 
 def test_a_run_goes_on_elsewhere_to_the_same_bits(url: str, train, workplace: Path, monkeypatch, capsys):
