@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import torch
+
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import UserError
 from dmil_core.methods.base import FineTuning, Policy
@@ -112,7 +114,8 @@ def policy_after(run: FinishedRun, support: Sequence[Demonstration], steps: int)
         steps: of fine-tuning.
     """
     method = run.checkpoint.method(run.experiment.suite.action_dim)
-    return method.adapt(run.checkpoint.tensors(), support, FineTuning(steps, run.config.evaluation.learning_rate))
+    parameters = {name: torch.from_numpy(array) for name, array in run.checkpoint.parameters.items()}
+    return method.adapt(parameters, support, FineTuning(steps, run.config.evaluation.learning_rate))
 
 
 def policies(run: FinishedRun, support: Sequence[Demonstration]) -> dict[str, Policy]:

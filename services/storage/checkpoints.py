@@ -155,7 +155,7 @@ class Checkpoint:
         )
 
     def tensors(self) -> Parameters:
-        """Return the parameters, a new copy each time, laid out as in meta-training."""
+        """Return the parameters, a new copy each time, laid out as in meta-training: the last bits depend on it."""
         return unflatten(torch.from_numpy(self.state.parameters), self.manifest.torch_shapes)
 
     def method(self, action_dim: int) -> Method[Any]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 from mlflow.models import set_model
 from mlflow.pyfunc.model import PythonModel, PythonModelContext
 
@@ -30,7 +31,8 @@ class Imitator(PythonModel):
         """Read the checkpoint."""
         checkpoint = Checkpoint(Path(context.artifacts["checkpoint"]))
         self._action_dim: int = context.model_config["action_dim"]
-        self._method, self._parameters = checkpoint.method(self._action_dim), checkpoint.tensors()
+        self._method = checkpoint.method(self._action_dim)
+        self._parameters = {name: torch.tensor(array) for name, array in checkpoint.parameters.items()}
         self._evaluation = checkpoint.manifest.config.evaluation
         self.policies: dict[tuple[str, FineTuning], Policy] = {}
 
