@@ -156,6 +156,15 @@ def test_the_learner_receives_one_gradient(
         assert follow(meta_training).numbers == list(range(1, ITERATIONS + 1))
 
 
+def test_the_local_runner_gives_torch_its_threads_back(experiment: Experiment, monkeypatch: pytest.MonkeyPatch):
+    threads = [3]
+    monkeypatch.setattr("torch.get_num_threads", lambda: threads[-1])
+    monkeypatch.setattr("torch.set_num_threads", threads.append)
+    with open_runner("local", experiment.suite, None):
+        assert threads[-1] == 1
+    assert threads[-1] == 3
+
+
 @pytest.mark.parametrize("size", [1, CHUNK_LENGTH, CHUNK_LENGTH + 1, 3 * CHUNK_LENGTH])
 def test_chunks_concatenate_to_the_vector(size: int):
     vector = np.random.default_rng(0).normal(size=size).astype(np.float32)
