@@ -1,6 +1,7 @@
 """Success rates and scores with their intervals, and how evenly sub-skills are used."""
 
 from collections.abc import Sequence
+from math import isnan, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -8,17 +9,29 @@ from jaxtyping import Float
 from scipy.stats import binomtest, entropy, t, trim_mean
 
 
-class Rate(NamedTuple):
-    """A success rate with its denominator and interval, all as fractions of one."""
+class Mean(NamedTuple):
+    """A mean over episodes with its interval."""
 
-    successes: int
-    episodes: int
-    rate: float
+    mean: float
     low: float
+    """Lower end of the interval; NaN for a single score, which has no interval."""
     high: float
+    episodes: int
+    deviation: float = nan
+    """Standard deviation of several scores over episodes."""
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """How far the interval reaches below and above the mean; nowhere if there is none."""
+        return (0.0, 0.0) if isnan(self.low) else (max(0.0, self.mean - self.low), max(0.0, self.high - self.mean))
 
 
-def success_rate(outcomes: Sequence[bool], confidence: float = 0.95) -> Rate:
+def interval_text(low: float | None, high: float | None, digits: int, sign: str = "") -> str:
+    """Return an interval as text, empty if there is none; with `sign` "+" both ends have their sign."""
+    return "" if low is None or high is None or isnan(low) else f"{low:{sign}.{digits}f} to {high:{sign}.{digits}f}"
+
+
+def success_rate(outcomes: Sequence[bool], confidence: float = 0.95) -> Mean:
     """Return the success rate of `outcomes` with its Wilson score interval (Wilson, JASA 1927).
 
     Raises:
@@ -28,21 +41,10 @@ def success_rate(outcomes: Sequence[bool], confidence: float = 0.95) -> Rate:
         raise ValueError("outcomes: got no episode; a success rate needs at least one")
     successes = sum(map(bool, outcomes))
     interval = binomtest(successes, len(outcomes)).proportion_ci(confidence, method="wilson")
-    return Rate(successes, len(outcomes), successes / len(outcomes), float(interval.low), float(interval.high))
+    return Mean(successes / len(outcomes), float(interval.low), float(interval.high), len(outcomes))
 
 
-class MeanScore(NamedTuple):
-    """A mean with its denominator, spread and interval, in the scores' own unit."""
-
-    episodes: int
-    mean: float
-    deviation: float | None
-    """Standard deviation over episodes; a single one has none, and no interval."""
-    low: float | None
-    high: float | None
-
-
-def mean_score(scores: Sequence[float], confidence: float = 0.95) -> MeanScore:
+def mean_score(scores: Sequence[float], confidence: float = 0.95) -> Mean:
     """Return the mean of `scores` with Student's interval.
 
     Raises:
@@ -52,10 +54,10 @@ def mean_score(scores: Sequence[float], confidence: float = 0.95) -> MeanScore:
         raise ValueError("scores: got no episode; a mean needs at least one")
     mean, episodes = float(np.mean(scores)), len(scores)
     if episodes == 1:
-        return MeanScore(1, mean, None, None, None)
+        return Mean(mean, nan, nan, 1)
     deviation = float(np.std(scores, ddof=1))
     half = float(t.ppf((1 + confidence) / 2, episodes - 1)) * deviation / episodes**0.5
-    return MeanScore(episodes, mean, deviation, mean - half, mean + half)
+    return Mean(mean, mean - half, mean + half, episodes, deviation)
 
 
 def share_entropy(shares: Float[np.ndarray, " sub_skills"]) -> float:
@@ -66,20 +68,12 @@ def share_entropy(shares: Float[np.ndarray, " sub_skills"]) -> float:
     return float(entropy(shares) / np.log(len(shares))) if len(shares) > 1 else 0.0
 
 
-class Interval(NamedTuple):
-    """A mean with its interval."""
-
-    mean: float
-    low: float
-    high: float
-
-
 BOOTSTRAP_DRAWS = 2000
 
 
 def stratified_bootstrap(
     outcomes: Float[np.ndarray, "seeds tasks episodes"], draw: np.random.Generator, confidence: float = 0.95
-) -> Interval:
+) -> Mean:
     """Return the mean outcome with its percentile interval (Efron and Tibshirani 1993).
 
     Seeds are drawn with replacement, then for each of them the episodes of each task: so the interval covers what
@@ -97,7 +91,7 @@ def stratified_bootstrap(
         again = draw.integers(episodes, size=(BOOTSTRAP_DRAWS, tasks, episodes))
         means[:, place] = np.take_along_axis(chosen, again, axis=2).mean((1, 2))
     low, high = np.quantile(means.mean(1), [(1 - confidence) / 2, (1 + confidence) / 2])
-    return Interval(float(outcomes.mean()), float(low), float(high))
+    return Mean(float(outcomes.mean()), float(low), float(high), outcomes.size)
 
 
 def interquartile_mean(values: Sequence[float]) -> float:

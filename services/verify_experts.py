@@ -8,7 +8,7 @@ import numpy as np
 from rich.table import Table
 
 from dmil_core.errors import RunError, UserError, WorkError
-from dmil_core.statistics import success_rate
+from dmil_core.statistics import interval_text, success_rate
 from services.cli.arguments import Quiet, exit_code, parse
 from services.cli.composition import suite_settings
 from services.cli.progress import Bar, console
@@ -82,9 +82,9 @@ def _table(suite: TaskSuite, tasks: Sequence[str], rows: Sequence[VerificationRo
         steps = [row.steps for row in of_task if row.success] or [0]
         view.add_row(
             task or "all",
-            f"{rate.successes}/{rate.episodes}",
-            f"{rate.rate:.3f}",
-            f"{rate.low:.3f} to {rate.high:.3f}",
+            f"{sum(row.success for row in of_task)}/{rate.episodes}",
+            f"{rate.mean:.3f}",
+            interval_text(rate.low, rate.high, 3),
             *([f"{np.mean([row.score for row in of_task]):.2f}"] * scored),
             f"{np.mean(steps):.0f}",
             str(max(steps)),

@@ -21,7 +21,7 @@ from pydantic import BaseModel
 from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import UserError
 from dmil_core.seeding import named_rng
-from dmil_core.statistics import Interval, interquartile_mean, mean_score, stratified_bootstrap, success_rate
+from dmil_core.statistics import interquartile_mean, mean_score, stratified_bootstrap, success_rate
 from services.evaluation.paper_results import Published
 from services.evaluation.results import EpisodeResult, EvaluationFolder, Metric
 from services.evaluation.summary import sub_skill_use
@@ -234,17 +234,14 @@ def cell(
     """Return the mean of some outcomes with its interval, beside the paper's figure."""
     seeds = sorted(outcomes)
     values = np.stack([outcomes[seed].outcomes for seed in seeds])
-    low: float | None
-    high: float | None
     if len(seeds) > 1:
-        mean, low, high = stratified_bootstrap(values, named_rng(0, "table", *map(str, place)))
+        found = stratified_bootstrap(values, named_rng(0, "table", *map(str, place)))
         kind = "bootstrap over seeds and episodes"
     elif metric == "success_rate":
-        rate, kind = success_rate((values > 0).ravel().tolist()), "Wilson"
-        mean, low, high = rate.rate, rate.low, rate.high
+        found, kind = success_rate((values > 0).ravel().tolist()), "Wilson"
     else:
-        score, kind = mean_score(values.ravel().tolist()), "Student"
-        mean, low, high = score.mean, score.low, score.high
+        found, kind = mean_score(values.ravel().tolist()), "Student"
+    mean, low, high = found.mean, *((None, None) if np.isnan(found.low) else (found.low, found.high))
     outside = None
     if paper is not None and low is not None and high is not None:
         outside = not low <= paper.value <= high and abs(mean - paper.value) > (paper.spread or 0.0)
@@ -277,9 +274,11 @@ def difference(place: Place, baseline: str, outcomes: Outcomes, others: Outcomes
         if why := _what_differs(outcomes[seed], others[seed]):
             return Unpaired(**pair, why=why)
     values = np.stack([outcomes[seed].outcomes - others[seed].outcomes for seed in seeds])
-    found: Interval = stratified_bootstrap(values, named_rng(0, "difference", *map(str, place)))
+    found = stratified_bootstrap(values, named_rng(0, "difference", *map(str, place)))
     differs: Answer = "yes, higher" if found.low > 0 else "yes, lower" if found.high < 0 else "not decided"
-    return Difference(**pair, seeds=seeds, pairs=values.size, **found._asdict(), differs=differs)
+    return Difference(
+        **pair, seeds=seeds, pairs=values.size, mean=found.mean, low=found.low, high=found.high, differs=differs
+    )
 
 
 def _what_differs(one: Tried, other: Tried) -> str | None:

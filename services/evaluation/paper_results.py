@@ -29,8 +29,8 @@ class Published(BaseModel):
     spread: float | None
     table: str
 
-    def in_words(self, digits: int) -> str:
-        """Return it to so many digits."""
+    def text(self, digits: int) -> str:
+        """Return the figure, with its spread if one is printed, to so many digits."""
         spread = "" if self.spread is None else f" ± {self.spread:.{digits}f}"
         return f"{self.value:.{digits}f}{spread}"
 

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from rich.table import Table
 
 from dmil_core.settings import MethodConfig
-from dmil_core.statistics import Rate, mean_score, share_entropy, success_rate
+from dmil_core.statistics import interval_text, mean_score, share_entropy, success_rate
 from services.evaluation.paper_results import Published, figure_of
 from services.evaluation.results import AdaptationResult, EpisodeResult
 from services.storage.checkpoints import Checkpoint
@@ -124,7 +124,7 @@ def cells(episodes: Sequence[EpisodeResult], best_score: int, method: MethodConf
     found = []
     for (suite, split, shots), group in groupby(sorted(episodes, key=key), key=key):
         rows = list(group)
-        rate: Rate = success_rate([row.success for row in rows])
+        rate = success_rate([row.success for row in rows])
         tasks = dict.fromkeys(row.task for row in rows)
         per_task = {task: float(np.mean([row.success for row in rows if row.task == task])) for task in tasks}
         found.append(
@@ -133,7 +133,7 @@ def cells(episodes: Sequence[EpisodeResult], best_score: int, method: MethodConf
                 split=split,
                 shots=shots,
                 episodes=rate.episodes,
-                success_rate=rate.rate,
+                success_rate=rate.mean,
                 low=rate.low,
                 high=rate.high,
                 per_task=per_task,
@@ -146,15 +146,14 @@ def cells(episodes: Sequence[EpisodeResult], best_score: int, method: MethodConf
 
 def _score(rows: Sequence[EpisodeResult], best: int) -> Score:
     mean = mean_score([float(row.score) for row in rows])
+    spread = {"deviation": mean.deviation, "low": mean.low, "high": mean.high}
     by_task: dict[str, list[int]] = {}
     for row in rows:
         by_task.setdefault(row.task, []).append(row.score)
     return Score(
         best=best,
         mean=mean.mean,
-        deviation=mean.deviation,
-        low=mean.low,
-        high=mean.high,
+        **{name: None if np.isnan(value) else value for name, value in spread.items()},
         mean_of_best=float(np.mean([np.mean(sorted(scores)[-BEST:]) for scores in by_task.values()])),
         per_task={task: float(np.mean(scores)) for task, scores in by_task.items()},
     )
@@ -182,14 +181,14 @@ def rates(rows: Sequence[Cell], use: Mapping[Split, SubSkillUse]) -> dict[str, f
     """Return the metrics of an evaluation by the names they are tracked under: of each task, and in all."""
     found: dict[str, float] = {}
     for cell in rows:
-        name = f"{cell.split}/{cell.shots}-shot"
-        found |= {f"success_rate/{name}": cell.success_rate, f"success_rate_low/{name}": cell.low}
-        found |= {f"success_rate_high/{name}": cell.high, f"episodes/{name}": float(cell.episodes)}
+        name, score = f"{cell.split}/{cell.shots}-shot", cell.score
+        means: dict[str, float | None] = {"success_rate": cell.success_rate, "success_rate_low": cell.low}
+        means |= {"success_rate_high": cell.high, "episodes": float(cell.episodes)}
+        if score is not None:
+            means |= {"score": score.mean, f"score_best_{BEST}": score.mean_of_best}
+            means |= {"score_low": score.low, "score_high": score.high}
+        found |= {f"{metric}/{name}": value for metric, value in means.items() if value is not None}
         found |= {f"task_success_rate/{name}/{task}": rate for task, rate in cell.per_task.items()}
-        if cell.score is not None:
-            found |= {f"score/{name}": cell.score.mean, f"score_best_{BEST}/{name}": cell.score.mean_of_best}
-            if cell.score.low is not None and cell.score.high is not None:
-                found |= {f"score_low/{name}": cell.score.low, f"score_high/{name}": cell.score.high}
     for split, figures in use.items():
         found |= {f"agreement/{split}": figures.agreement, f"sub_skill_entropy/{split}": figures.entropy}
     return found
@@ -260,17 +259,13 @@ def headline(summary: Summary) -> list[list[str]]:
 def _fields(cell: Cell) -> list[str]:
     successes = f"{round(cell.success_rate * cell.episodes)}/{cell.episodes}"
     fields = [cell.suite, cell.split, str(cell.shots), successes, f"{cell.success_rate:.3f}"]
-    fields.append(f"{cell.low:.3f} to {cell.high:.3f}")
+    fields.append(interval_text(cell.low, cell.high, 3))
     if (score := cell.score) is None:
         fields += ["", "", ""]
-    elif score.low is None or score.high is None:
-        fields += [f"{score.mean:.2f}", "", f"{score.mean_of_best:.2f}"]
     else:
-        fields += [f"{score.mean:.2f} ± {score.deviation:.2f}", f"{score.low:.2f} to {score.high:.2f}"]
-        fields.append(f"{score.mean_of_best:.2f}")
-    paper = cell.paper
-    digits = 3 if cell.score is None else 2
-    return [*fields, "" if paper is None else paper.in_words(digits)]
+        spread = "" if score.deviation is None else f" ± {score.deviation:.2f}"
+        fields += [f"{score.mean:.2f}{spread}", interval_text(score.low, score.high, 2), f"{score.mean_of_best:.2f}"]
+    return [*fields, "" if cell.paper is None else cell.paper.text(3 if score is None else 2)]
 
 
 def _of_task(cell: Cell, task: str) -> str:

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from dmil_core.configs import EvaluationConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.errors import UserError, explain
-from dmil_core.statistics import Rate, success_rate
+from dmil_core.statistics import Mean, interval_text, success_rate
 from services.cli.composition import with_evaluation
 from services.cli.progress import Bar, console
 from services.distributed.runner import Runner
@@ -60,7 +60,7 @@ class Point(NamedTuple):
 
     shots: int
     steps: int
-    rate: Rate
+    success: Mean
     held_out_error: float | None
     """Mean ‖π(s) − a‖² over support sets; none where a policy has diverged, or no demonstration is left."""
     support_error: float | None
@@ -257,9 +257,8 @@ def _draw(found: Sequence[Point]) -> Picture:
             own = [point for point in found if point.shots == size]
             at = np.array([steps.index(point.steps) for point in own]) + APART * (place - (len(sizes) - 1) / 2)
             style = {"color": colour_of(place), "marker": marker_of(place), "markersize": 4, "label": f"{size}-shot"}
-            rates = np.array([[rate.rate, rate.low, rate.high] for rate in (point.rate for point in own)]).T
-            reach = np.abs(rates[1:] - rates[0])
-            success.errorbar(at, rates[0], yerr=reach, elinewidth=0.8, capsize=2, **style)
+            rates, reach = [point.success.mean for point in own], np.transpose([point.success.reach for point in own])
+            success.errorbar(at, rates, yerr=reach, elinewidth=0.8, capsize=2, **style)
             held_out.plot(at, [_or_nan(point.held_out_error) for point in own], **style)
             support.plot(at, [_or_nan(point.support_error) for point in own], **style)
         success.set(title="success", ylabel="success rate", ylim=(-0.02, 1.02))
@@ -284,7 +283,7 @@ def _or_nan(error: float | None) -> float:
 
 def _course(found: Sequence[Point], shots: int) -> str:
     own = [point for point in found if point.shots == shots]
-    return "success " + ", ".join(f"{point.rate.rate:.2f} after {point.steps} steps" for point in own)
+    return "success " + ", ".join(f"{point.success.mean:.2f} after {point.steps} steps" for point in own)
 
 
 def _table(found: Sequence[Point]) -> DataTable:
@@ -292,9 +291,9 @@ def _table(found: Sequence[Point]) -> DataTable:
         [
             point.shots,
             point.steps,
-            f"{point.rate.rate:.3f}",
-            f"{point.rate.low:.3f} to {point.rate.high:.3f}",
-            f"{point.rate.successes} of {point.rate.episodes}",
+            f"{point.success.mean:.3f}",
+            interval_text(point.success.low, point.success.high, 3),
+            f"{round(point.success.mean * point.success.episodes)} of {point.success.episodes}",
             "" if point.held_out_error is None else f"{point.held_out_error:.4f}",
             "" if point.support_error is None else f"{point.support_error:.4f}",
         ]

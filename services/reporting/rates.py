@@ -2,9 +2,8 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
-from dmil_core.statistics import mean_score, success_rate
+from dmil_core.statistics import Mean, interval_text, mean_score, success_rate
 from services.evaluation.results import EpisodeResult
 from services.evaluation.summary import AGAINST_COLLAPSE, described, headline
 from services.experiments.finished_run import FinishedRun
@@ -17,23 +16,7 @@ ABREAST = 4
 INCHES_A_TASK = 0.22
 
 
-class Estimate(NamedTuple):
-    """A mean over episodes with its 95% interval, which a single score has not."""
-
-    mean: float
-    low: float | None
-    high: float | None
-    counted: str
-    """What it is the mean of, in a few characters."""
-
-    @property
-    def reach(self) -> tuple[float, float]:
-        """How far the interval goes below and above the mean."""
-        low, high = (self.mean if side is None else side for side in (self.low, self.high))
-        return max(0.0, self.mean - low), max(0.0, high - self.mean)
-
-
-def estimates(episodes: Sequence[EpisodeResult], *, scores: bool) -> dict[tuple[Split, int, str], Estimate]:
+def estimates(episodes: Sequence[EpisodeResult], *, scores: bool) -> dict[tuple[Split, int, str], Mean]:
     """Return the success rate, with Wilson's interval, by split, shots and task.
 
     Args:
@@ -43,17 +26,14 @@ def estimates(episodes: Sequence[EpisodeResult], *, scores: bool) -> dict[tuple[
     groups: dict[tuple[Split, int, str], list[EpisodeResult]] = defaultdict(list)
     for row in episodes:
         groups[row.split, row.shots, row.task].append(row)
-    return {key: _score(rows) if scores else _rate(rows) for key, rows in groups.items()}
+    if scores:
+        return {key: mean_score([float(row.score) for row in rows]) for key, rows in groups.items()}
+    return {key: success_rate([row.success for row in rows]) for key, rows in groups.items()}
 
 
-def _rate(rows: Sequence[EpisodeResult]) -> Estimate:
-    rate = success_rate([row.success for row in rows])
-    return Estimate(rate.rate, rate.low, rate.high, f"{rate.successes}/{rate.episodes}")
-
-
-def _score(rows: Sequence[EpisodeResult]) -> Estimate:
-    mean = mean_score([float(row.score) for row in rows])
-    return Estimate(mean.mean, mean.low, mean.high, f"of {mean.episodes}")
+def _count(mean: Mean, best: int) -> str:
+    """Return what a success rate, whose best is 1, or a mean score is over, in a few characters."""
+    return f"{round(mean.mean * mean.episodes)}/{mean.episodes}" if best == 1 else f"of {mean.episodes}"
 
 
 def table_of_all(finished: FinishedRun) -> list[Part]:
@@ -96,24 +76,18 @@ def rates_of_tasks(finished: FinishedRun) -> Section:
     head = ["task", "split", "shots", "successes", "success rate", "95% interval"]
     rows = []
     for (split, shots, task), rate in rates.items():
-        row = [task, split, shots, rate.counted, f"{rate.mean:.3f}", _interval(rate, 3)]
+        row = [task, split, shots, _count(rate, 1), f"{rate.mean:.3f}", interval_text(rate.low, rate.high, 3)]
         if scores:
             score = scores[split, shots, task]
-            row += [f"{score.mean:.2f}", _interval(score, 2)]
+            row += [f"{score.mean:.2f}", interval_text(score.low, score.high, 2)]
         rows.append(row)
     head += [f"score of {best}", "interval of the score"] if scores else []
     return Section("Success of each task", [*parts, DataTable("Each task", head, rows)])
 
 
-def _interval(estimate: Estimate, digits: int) -> str:
-    if estimate.low is None or estimate.high is None:
-        return ""
-    return f"{estimate.low:.{digits}f} to {estimate.high:.{digits}f}"
-
-
-def _bars(split: Split, found: Mapping[tuple[Split, int, str], Estimate], what: str, best: int) -> Picture:
+def _bars(split: Split, found: Mapping[tuple[Split, int, str], Mean], what: str, best: int) -> Picture:
     """Draw a split's tasks, the best on top in all panels alike, one panel for each number of shots."""
-    by_shots: dict[int, dict[str, Estimate]] = defaultdict(dict)
+    by_shots: dict[int, dict[str, Mean]] = defaultdict(dict)
     for (own, shots, task), estimate in found.items():
         if own == split:
             by_shots[shots][task] = estimate
@@ -131,7 +105,8 @@ def _bars(split: Split, found: Mapping[tuple[Split, int, str], Estimate], what: 
             over_all = sum(estimate.mean for estimate in own) / len(own)
             axis.axvline(over_all, linestyle="dashed", color=colour_of(3))
             for place, estimate in enumerate(own):
-                axis.text(1.02, place, estimate.counted, transform=axis.get_yaxis_transform(), va="center", size=7.5)
+                count = _count(estimate, best)
+                axis.text(1.02, place, count, transform=axis.get_yaxis_transform(), va="center", size=7.5)
             axis.set(title=f"{shots}-shot: {over_all:.2f} on average", xlabel=what, xlim=(0, best * 1.02))
             axis.set_yticks(range(len(tasks)), tasks if index % columns == 0 else [])
             axis.set_ylim(-0.6, len(tasks) - 0.4)
@@ -141,7 +116,7 @@ def _bars(split: Split, found: Mapping[tuple[Split, int, str], Estimate], what: 
         return drawn(figure, f"{split}: {what} of each task", _in_words(by_shots, tasks, what))
 
 
-def _in_words(by_shots: Mapping[int, Mapping[str, Estimate]], tasks: Sequence[str], what: str) -> str:
+def _in_words(by_shots: Mapping[int, Mapping[str, Mean]], tasks: Sequence[str], what: str) -> str:
     told = []
     for shots in sorted(by_shots):
         own = by_shots[shots]

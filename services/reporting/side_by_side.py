@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from dmil_core.statistics import interval_text
 from services.evaluation.comparison import DIGITS, Cell, Comparison, Contender, Difference, Place, Unpaired
 from services.reporting.bands import curves
 from services.reporting.drawing import Picture
@@ -80,8 +81,8 @@ def _overview(comparison: Comparison) -> list[Part]:
     digits = DIGITS[comparison.metric]
     rows = []
     for of in comparison.cells:
-        interval = "" if of.low is None else _together(f"{of.low:.{digits}f} to {of.high:.{digits}f}")
-        paper = "" if of.paper is None else _together(of.paper.in_words(digits))
+        interval = _together(interval_text(of.low, of.high, digits))
+        paper = "" if of.paper is None else _together(of.paper.text(digits))
         apart = "" if of.difference is None else f"{of.difference:+.{digits}f}{', outside' if of.outside else ''}"
         in_use = "" if of.sub_skills_in_use is None else f"{of.sub_skills_in_use:.1f}"
         counts = [f"{len(of.seeds)}", f"{of.tasks}", f"{of.episodes}"]
@@ -121,7 +122,7 @@ def _differences(comparison: Comparison) -> list[Part]:
     rows = []
     for of in comparison.pairs:
         if isinstance(of, Difference):
-            interval = f"{of.low:+.{digits}f} to {of.high:+.{digits}f}"
+            interval = interval_text(of.low, of.high, digits, "+")
             counts = f"{of.pairs}", f"{len(of.seeds)}"
             rows.append([*_place(comparison, of), f"{of.mean:+.{digits}f}", interval, of.differs, *counts])
     told = (

@@ -10,6 +10,7 @@ import tyro
 import yaml
 from rich.table import Table
 
+from dmil_core.statistics import interval_text
 from services.cli.arguments import parse
 from services.cli.progress import console
 from services.evaluation.comparison import DIGITS, Cell, Difference, Unpaired
@@ -33,11 +34,11 @@ def _figures(found: Cell | None, digits: int) -> list[str]:
     """Return a cell's mean and the paper's, a line each: none if it was not run."""
     if found is None:
         return []
-    interval = "" if found.low is None else f" ({found.low:.{digits}f} to {found.high:.{digits}f})"
-    lines = [f"{found.mean:.{digits}f}{interval}"]
+    interval = interval_text(found.low, found.high, digits)
+    lines = [f"{found.mean:.{digits}f}" + (f" ({interval})" if interval else "")]
     if found.paper is not None:
         mark = " outside" if found.outside else ""
-        lines.append(f"paper {found.paper.in_words(digits)}: {found.difference:+.{digits}f}{mark}")
+        lines.append(f"paper {found.paper.text(digits)}: {found.difference:+.{digits}f}{mark}")
     return lines
 
 
@@ -101,7 +102,7 @@ def _sample_fields(sample: Sample) -> list[str]:
 
 def _difference_fields(found: Difference, digits: int) -> list[str]:
     where = f"{found.suite}, {found.split}, {found.shots}-shot"
-    interval = f"{found.low:+.{digits}f} to {found.high:+.{digits}f}"
+    interval = interval_text(found.low, found.high, digits, "+")
     fields = [found.row, found.baseline, where, f"{found.mean:+.{digits}f}", interval]
     return [*fields, str(found.pairs), str(len(found.seeds)), found.differs]
 

@@ -84,7 +84,7 @@ def test_other_settings_are_measured_anew_and_no_others_shown(trained: Trained):
     run = trained("run")
     measure(run, counting(run), **SMALL)
     measure(run, counting(run), shots=(1,), steps=(2, 4), episodes=3)
-    assert [(point.shots, point.steps, point.rate.episodes) for point in points(run)] == [(1, 2, 3), (1, 4, 3)]
+    assert [(point.shots, point.steps, point.success.episodes) for point in points(run)] == [(1, 2, 3), (1, 4, 3)]
 
 
 def test_only_sizes_that_are_held_out_and_that_the_method_takes_are_measured(trained: Trained):
@@ -110,7 +110,7 @@ def test_a_policy_that_has_diverged_has_no_loss(trained: Trained):
     measure(run, counting(run), shots=(1,), steps=(0, 5), episodes=1)
     before, after = points(run)
     assert before.held_out_error is not None
-    assert (after.held_out_error, after.support_error, after.rate.successes) == (None, None, 0)
+    assert (after.held_out_error, after.support_error, after.success.mean) == (None, None, 0)
     table = next(part for part in adaptation_section(run).parts if isinstance(part, DataTable))
     assert table.rows[1][-2:] == ["", ""]
 
@@ -130,14 +130,14 @@ def test_the_section_shows_what_was_measured(trained: Trained, planar_visits: Pa
     ((words, width, height),) = opened.pictures()
     assert width > 300
     assert height > 100
-    assert f"1-shot success {points(run)[0].rate.rate:.2f} after 0 steps" in words
+    assert f"1-shot success {points(run)[0].success.mean:.2f} after 0 steps" in words
     texts = opened.page.locator("svg text").all_text_contents()
     assert {"1-shot", "3-shot", "success rate", "squared error of actions"} <= set(texts)
     table = "Success and loss over fine-tuning steps, all tasks together"
     assert opened.sorted_by(table, "fine-tuning steps") == ["0", "0", "2", "2"]
-    own = [point.rate for point in points(run)]
+    own = [point.success for point in points(run)]
     cells = opened.page.get_by_role("table", name=table).locator("tbody td").all_inner_texts()
-    assert all(f"{rate.successes} of {rate.episodes}" in cells for rate in own)
+    assert all(f"{round(rate.mean * rate.episodes)} of {rate.episodes}" in cells for rate in own)
 
 
 def test_a_damaged_plan_is_told(trained: Trained):
