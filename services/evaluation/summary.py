@@ -1,6 +1,6 @@
 """From result rows to the table that a run ends with."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
@@ -231,11 +231,12 @@ def table(summary: Summary) -> Table:
 def table_markdown(summary: Summary) -> str:
     """Lay the summary out as Markdown, with the success rate, and the score if there is one, of each task below."""
     head, *rows = headline(summary)
-    lines = [_row(head), _row(["---"] * len(head)), *map(_row, rows)]
+    lines = markdown_rows(head, rows)
     for split in dict.fromkeys(cell.split for cell in summary.rows):
         cells = [cell for cell in summary.rows if cell.split == split]
-        lines += ["", _row(["task", *(f"{cell.shots}-shot" for cell in cells)]), _row(["---"] * (len(cells) + 1))]
-        lines += [_row([task, *(_of_task(cell, task) for cell in cells)]) for task in sorted(cells[0].per_task)]
+        head = ["task", *(f"{cell.shots}-shot" for cell in cells)]
+        tasks = ([task, *(_of_task(cell, task) for cell in cells)] for task in sorted(cells[0].per_task))
+        lines += ["", *markdown_rows(head, tasks)]
     return f"Success rates of {described(summary)}.\n\n" + "\n".join(lines) + "\n"
 
 
@@ -273,8 +274,10 @@ def _of_task(cell: Cell, task: str) -> str:
     return f"{cell.per_task[task]:.2f}{score}"
 
 
-def _row(fields: Sequence[str]) -> str:
-    return f"| {' | '.join(fields)} |"
+def markdown_rows(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return the lines of a table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return [f"| {' | '.join(field.replace('|', '/') for field in fields)} |" for fields in lines]
 
 
 def write_summary(summary: Summary, path: Path) -> None:

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -21,10 +20,9 @@ from services.evaluation.evaluator import Evaluator
 from services.evaluation.results import EpisodeResult, ImitationResult, read_rows, write_rows
 from services.experiments.experiment import Experiment
 from services.experiments.finished_run import FinishedRun
-from services.reporting.drawing import Picture, colour_of, drawn, panels
+from services.reporting.drawing import Picture, colour_of, drawn, legend_of_markers, marker_of, panels
 from services.reporting.lineup import MOST_TASKS, policy_after
 from services.reporting.page import DataTable, Part, Prose, Section
-from services.reporting.sub_skill_pictures import marker_of
 from services.storage.files import read_file, write_file
 
 FOLDER, PLAN, IMITATION = "adaptation", "plan.json", "imitation.jsonl"
@@ -270,9 +268,7 @@ def _draw(found: Sequence[Point]) -> Picture:
         for axis in axes:
             axis.set_xticks(range(len(steps)), map(str, steps))
             axis.set_xlabel("fine-tuning steps, not to scale")
-        handles = [Line2D([], [], color=colour_of(place), marker=marker_of(place)) for place in range(len(sizes))]
-        names = [f"{size}-shot" for size in sizes]
-        figure.legend(handles, names, loc="outside lower center", ncols=len(sizes), frameon=False)
+        legend_of_markers(figure, [f"{size}-shot" for size in sizes], "solid")
         told = "; ".join(f"{size}-shot {_course(found, size)}" for size in sizes)
         return drawn(figure, "Success and loss over fine-tuning steps", f"Bars are 95% Wilson intervals. {told}.")
 

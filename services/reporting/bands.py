@@ -1,7 +1,7 @@
 """Curves of training: the mean over seeds, with a band."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -19,13 +19,12 @@ POINTS = 60
 
 
 class Curve(NamedTuple):
-    """One metric over the iterations."""
+    """One metric over the iterations, in a few points."""
 
     iterations: Float[np.ndarray, " points"]
     mean: Float[np.ndarray, " points"]
-    """Over seeds."""
     low: Float[np.ndarray, " points"]
-    """Of the lowest seed; of a single one, the lower end of its interval where the metric has one."""
+    """Lower end of the band: of the lowest seed, of an interval or a percentile."""
     high: Float[np.ndarray, " points"]
 
 
@@ -45,8 +44,7 @@ def curve_of(metrics: Metrics, name: str) -> Curve | None:
     if len(seeds) == 1 and any(f"{rate}_low/{rest}" in row for row in seeds[0]):
         both = [_by_iteration(seeds[0], f"{rate}_{end}/{rest}") for end in ("low", "high")]
         low, high = _in_means(np.array([[own[step] for step in steps] for own in both]))
-    size = _size(len(steps))
-    ends = [steps[first : first + size][-1] for first in range(0, len(steps), size)]
+    ends = [steps[places][-1] for places in chunks_of(len(steps), POINTS)]
     return Curve(np.array(ends, float), values.mean(0), low, high)
 
 
@@ -54,14 +52,14 @@ def _by_iteration(rows: Sequence[Mapping[str, float]], name: str) -> dict[int, f
     return {int(row["iteration"]): row[name] for row in rows if name in row}
 
 
-def _size(count: int) -> int:
-    return -(-count // POINTS)
+def chunks_of(count: int, most: int) -> list[slice]:
+    """Return which of so many iterations are drawn as one point, so that there are at most `most` points."""
+    size = -(-count // most)
+    return [slice(first, first + size) for first in range(0, count, size)]
 
 
 def _in_means(values: Float[np.ndarray, "seeds iterations"]) -> Float[np.ndarray, "seeds points"]:
-    """Return means of neighbouring iterations, of as many each as leave no more than `POINTS`."""
-    size = _size(values.shape[1])
-    return np.stack([values[:, first : first + size].mean(1) for first in range(0, values.shape[1], size)], 1)
+    return np.stack([values[:, places].mean(1) for places in chunks_of(values.shape[1], POINTS)], 1)
 
 
 def curves(title: str, rows: Mapping[str, Metrics], names: Mapping[str, str], *, rate: bool = False) -> Picture | None:
@@ -90,7 +88,7 @@ def curves(title: str, rows: Mapping[str, Metrics], names: Mapping[str, str], *,
         for axis, (words, own) in zip(axes, drawable.items(), strict=False):
             for index, (row, curve) in enumerate(own.items()):
                 if curve is not None:
-                    legend[row] = _draw(axis, index, curve)
+                    legend[row] = draw_curve(axis, index, curve, row, "o" if len(curve.mean) < 20 else None, 3)
                     ends = f"from {curve.mean[0]:.3g} to {curve.mean[-1]:.3g}"
                     told.setdefault(words, []).append(f"{row} {ends}")
             axis.set(title=words, xlabel="iteration")
@@ -110,9 +108,11 @@ def curves(title: str, rows: Mapping[str, Metrics], names: Mapping[str, str], *,
         return drawn(figure, title, f"{ends}.")
 
 
-def _draw(axis: Axes, index: int, curve: Curve) -> Line2D:
-    colour, dashes = colour_of(index), DASHES[index % len(DASHES)]
-    marker = "o" if len(curve.mean) < 20 else None
-    (line,) = axis.plot(curve.iterations, curve.mean, color=colour, linestyle=dashes, marker=marker, markersize=3)
-    axis.fill_between(curve.iterations, curve.low, curve.high, color=colour, alpha=0.15, linewidth=0)
+def draw_curve(
+    axis: Axes, index: int, curve: Curve, label: str, marker: str | None = None, markersize: float | None = None
+) -> Line2D:
+    """Draw a curve with its band, in the colour and the dashes of its index."""
+    style: dict[str, Any] = {"color": colour_of(index), "linestyle": DASHES[index % len(DASHES)]}
+    (line,) = axis.plot(curve.iterations, curve.mean, label=label, marker=marker, markersize=markersize, **style)
+    axis.fill_between(curve.iterations, curve.low, curve.high, color=colour_of(index), alpha=0.15, linewidth=0)
     return line

@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,7 +11,8 @@ from dmil_core.settings import MethodConfig
 from services.evaluation.results import EpisodeResult
 from services.evaluation.summary import cells
 from services.experiments.finished_run import FinishedRun
-from services.reporting.drawing import DASHES, Picture, colour_of, drawn, panels, style_of
+from services.reporting.bands import Curve, chunks_of, draw_curve
+from services.reporting.drawing import Picture, colour_of, drawn, marker_of, panels, style_of
 from services.reporting.page import Part, Prose, Section
 from services.suites.base import Split
 
@@ -31,7 +32,6 @@ WIDE = 20
 COLUMNS = 3
 """Panels side by side."""
 HATCHES = ("", "//", "..", "\\\\", "xx", "--", "oo", "||", "++", "**")
-MARKERS = "osD^vPX*"
 
 
 class Panel(NamedTuple):
@@ -102,16 +102,6 @@ WORDS = {
 """What a metric's line is called, if not by its name."""
 
 
-class Curve(NamedTuple):
-    """A metric over the iterations, in a few points."""
-
-    label: str
-    iterations: Sequence[int]
-    means: Sequence[float]
-    low: Sequence[float]
-    high: Sequence[float]
-
-
 def training_curves(finished: FinishedRun) -> Section:
     """Return the section with all that was measured in meta-training, and at checkpoints on the way."""
     parts: list[Part] = []
@@ -137,7 +127,7 @@ def draw_metrics(metrics: Metrics) -> list[Picture]:
     others = [Panel(_words(name), "", (name,)) for name in names if name not in known]
     pictures = []
     for title, panels_ in {**PICTURES, OTHERS: others}.items():
-        curves = {panel: [_curve(metrics, name) for name in _held(panel, names)] for panel in panels_}
+        curves = {panel: {_words(name): _curve(metrics, name) for name in _held(panel, names)} for panel in panels_}
         if filled := {panel: found for panel, found in curves.items() if found}:
             pictures.append(_picture(title, filled))
     return pictures
@@ -159,15 +149,13 @@ def _words(name: str) -> str:
 
 
 def _curve(metrics: Metrics, name: str) -> Curve:
-    rows = [(int(row["iteration"]), row[name]) for row in metrics if name in row]
-    size = -(-len(rows) // DRAWN)
-    chunks = [np.array(rows[first : first + size]) for first in range(0, len(rows), size)]
-    low, high = np.transpose([np.percentile(chunk[:, 1], MIDDLE) for chunk in chunks]).tolist()
-    means = [float(chunk[:, 1].mean()) for chunk in chunks]
-    return Curve(_words(name), [int(chunk[-1, 0]) for chunk in chunks], means, low, high)
+    rows = np.array([(row["iteration"], row[name]) for row in metrics if name in row])
+    chunks = [rows[places] for places in chunks_of(len(rows), DRAWN)]
+    low, high = np.transpose([np.percentile(chunk[:, 1], MIDDLE) for chunk in chunks])
+    return Curve(np.array([chunk[-1, 0] for chunk in chunks]), np.array([c[:, 1].mean() for c in chunks]), low, high)
 
 
-def _picture(title: str, filled: Mapping[Panel, Sequence[Curve]]) -> Picture:
+def _picture(title: str, filled: Mapping[Panel, Mapping[str, Curve]]) -> Picture:
     columns = min(len(filled), COLUMNS)
     rows = -(-len(filled) // columns)
     with panels(rows, columns, width=3.9 * columns, height=2.8 * rows) as (figure, axes):
@@ -181,34 +169,32 @@ def _picture(title: str, filled: Mapping[Panel, Sequence[Curve]]) -> Picture:
         return drawn(figure, title, " ".join(_in_words(panel, curves) for panel, curves in filled.items()))
 
 
-def _in_words(panel: Panel, curves: Sequence[Curve]) -> str:
-    each = [f"{curve.label} from {curve.means[0]:.3g} to {curve.means[-1]:.3g}" for curve in curves]
+def _in_words(panel: Panel, curves: Mapping[str, Curve]) -> str:
+    each = [f"{label} from {curve.mean[0]:.3g} to {curve.mean[-1]:.3g}" for label, curve in curves.items()]
     return f"{panel.title.capitalize()}: {'; '.join(each)}."
 
 
-def _draw_lines(axis: Axes, curves: Sequence[Curve]) -> None:
-    for index, curve in enumerate(curves):
-        style: dict[str, Any] = {"color": colour_of(index), "linestyle": DASHES[index % len(DASHES)]}
-        marker = "." if len(curve.means) < FEW else None
-        axis.plot(curve.iterations, curve.means, label=curve.label, marker=marker, **style)
-        axis.fill_between(curve.iterations, curve.low, curve.high, color=colour_of(index), alpha=0.15, linewidth=0)
-    values = [value for curve in curves for value in (*curve.low, *curve.means)]
-    if min(values) > 0 and max(values) > WIDE * min(values):
+def _draw_lines(axis: Axes, curves: Mapping[str, Curve]) -> None:
+    for index, (label, curve) in enumerate(curves.items()):
+        draw_curve(axis, index, curve, label, "." if len(curve.mean) < FEW else None)
+    values = np.concatenate([np.concatenate([curve.low, curve.mean]) for curve in curves.values()])
+    if values.min() > 0 and values.max() > WIDE * values.min():
         axis.set_yscale("log")
     if len(curves) > 1:
         axis.legend(fontsize="small")
 
 
-def _draw_shares(axis: Axes, curves: Sequence[Curve]) -> None:
+def _draw_shares(axis: Axes, curves: Mapping[str, Curve]) -> None:
     """Stack the shares, which add up to 1, each with its sub-skill's colour, hatch and name."""
-    iterations = np.array(curves[0].iterations, float)
+    iterations = next(iter(curves.values())).iterations
     if len(iterations) == 1:
         iterations = iterations[0] + np.array([-0.5, 0.5])  # a single point has no width
-    edges = np.cumsum([np.broadcast_to(curve.means, iterations.shape) for curve in curves], axis=0)
+    labels = list(curves)
+    edges = np.cumsum([np.broadcast_to(curve.mean, iterations.shape) for curve in curves.values()], axis=0)
     for index, (low, high) in enumerate(zip((np.zeros_like(edges[0]), *edges), edges, strict=False)):
         axis.fill_between(
             iterations, low, high, facecolor=colour_of(index), edgecolor="white", linewidth=0.3,
-            hatch=HATCHES[index % len(HATCHES)], label=curves[index].label,
+            hatch=HATCHES[index % len(HATCHES)], label=labels[index],
         )  # fmt: skip
     axis.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True)
 
@@ -245,7 +231,7 @@ def _progress(title: str, what: str, best: int, lines: Lines) -> Picture:
             for index, (key, points) in enumerate((key, found) for key, found in lines.items() if key[0] == split):
                 iterations, means, low, high = map(list, zip(*points, strict=True))
                 label = f"{key[1]}-shot"
-                axis.plot(iterations, means, label=label, marker=MARKERS[index % len(MARKERS)], **style_of(index))
+                axis.plot(iterations, means, label=label, marker=marker_of(index), **style_of(index))
                 axis.fill_between(iterations, low, high, color=colour_of(index), alpha=0.2, linewidth=0)
                 told.append(
                     f"{split}, {label}: " + ", ".join(f"{m:.2f} at {i}" for i, m in zip(iterations, means, strict=True))

@@ -1,23 +1,27 @@
 """Plots as inline SVG: legible in light and dark, with a text alternative, each sub-skill in one colour everywhere."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from io import StringIO
 from itertools import count
 from typing import Any, NamedTuple
 
 import matplotlib
+import numpy as np
 
 matplotlib.use("Agg")
 from markupsafe import Markup, escape
 from matplotlib import pyplot
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from services.cli.colours import COLOURS, colour_of
 
 DASHES = ("solid", "dashed", "dotted", "dashdot")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
 INK = "#010203"
 """Stands for the page's own colour of text until the SVG is on the page."""
 STYLE: dict[Any, Any] = {
@@ -56,6 +60,23 @@ class Picture(NamedTuple):
 def style_of(index: int) -> dict[str, Any]:
     """Return how one of several lines is drawn: by colour, and where colours begin again by its dashes."""
     return {"color": colour_of(index), "linestyle": DASHES[index // len(COLOURS) % len(DASHES)]}
+
+
+def marker_of(index: int) -> str:
+    """Return the marker of a sub-skill, the same in every picture; that of a line, where there are no sub-skills."""
+    return MARKERS[index % len(MARKERS)]
+
+
+def ink_on(colour: Any) -> str:
+    """Return black or white, whichever has the higher contrast with a colour (WCAG 2)."""
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in to_rgb(colour)]
+    return "#000000" if np.dot(linear, (0.2126, 0.7152, 0.0722)) > 0.179 else "#ffffff"
+
+
+def legend_of_markers(figure: Figure, names: Sequence[str], linestyle: Any = "none") -> None:
+    """Draw a legend below a figure, with the colour and the marker of each name."""
+    handles = [Line2D([], [], marker=marker_of(k), color=colour_of(k), linestyle=linestyle) for k in range(len(names))]
+    figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 6), frameon=False)
 
 
 @contextmanager

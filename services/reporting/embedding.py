@@ -5,15 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int64
-from matplotlib.lines import Line2D
 
 from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.settings import sub_skills_of
 from services.cli.progress import Bar
-from services.reporting.drawing import Picture, colour_of, drawn, panels
+from services.reporting.drawing import Picture, colour_of, drawn, legend_of_markers, marker_of, panels
 from services.reporting.lineup import Lineup, has_sub_skills, policies
 from services.reporting.page import Part, Prose, Section
-from services.reporting.sub_skill_pictures import marker_of
 
 SHOTS, OTHERS = 3, 16
 """Demonstrations that the paper adapts to, and those whose states it draws."""
@@ -122,8 +120,7 @@ def _draw(lineup: Lineup, task: str, shots: int, perplexity: float, seed: int) -
                 axis.plot(x, y, marker_of(k), color=colour_of(k), markersize=3, markeredgewidth=0, alpha=0.85)
             axis.set(title=panel.title, xticks=[], yticks=[], xlabel="t-SNE 1", ylabel="t-SNE 2")
         most = max(panel.sub_skills for panel in shown)
-        handles = [Line2D([], [], marker=marker_of(k), color=colour_of(k), linestyle="none") for k in range(most)]
-        figure.legend(handles, [f"sub-skill {k}" for k in range(most)], loc="outside lower center", ncols=min(most, 6))
+        legend_of_markers(figure, [f"sub-skill {k}" for k in range(most)])
         return drawn(figure, f"t-SNE of {task}", _told(shown, kept, len(support), len(others), perplexity, seed))
 
 

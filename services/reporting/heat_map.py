@@ -6,28 +6,10 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib import colormaps
 
-from services.reporting.drawing import Picture, drawn, panels
+from services.reporting.drawing import Picture, drawn, ink_on, panels
 
 COLOURS = colormaps["cividis"].resampled(21)
 """Even to colour-blind eyes, and in grey (Nuñez et al. 2018)."""
-INKS = {"#000000": 0.0, "#ffffff": 1.0}
-"""Of the numbers, with the luminance of each."""
-
-
-def ink_on(colour: Sequence[float]) -> str:
-    """Return black or white, whichever stands out more from a colour by the contrast ratio of WCAG 2.
-
-    Args:
-        colour: red, green and blue from 0 to 1.
-    """
-    parts = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in colour[:3]]
-    luminance = float(np.dot(parts, (0.2126, 0.7152, 0.0722)))
-
-    def contrast(ink: str) -> float:
-        low, high = sorted((luminance, INKS[ink]))
-        return (high + 0.05) / (low + 0.05)
-
-    return max(INKS, key=contrast)
 
 
 def heat_map(
@@ -59,7 +41,7 @@ def heat_map(
         )
         for (line, column), value in np.ndenumerate(values):
             if not np.isnan(value):
-                ink = ink_on(COLOURS(value / top))
+                ink = ink_on(COLOURS(value / top)[:3])
                 axis.text(column + 0.5, line + 0.5, f"{value:.{digits}f}", color=ink, ha="center", va="center")
         turned = {"rotation": 30, "ha": "left", "rotation_mode": "anchor"} if max(map(len, rows)) > 9 else {}
         axis.set_xticks(np.arange(len(rows)) + 0.5, rows, **turned)

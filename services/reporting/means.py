@@ -9,10 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from services.evaluation.comparison import DIGITS, Cell, Comparison
-from services.reporting.drawing import Picture, colour_of, drawn, panels
+from services.reporting.drawing import Picture, colour_of, drawn, marker_of, panels
 
-MARKERS = "os^Dv"
-"""Of the numbers of shots."""
 APART = 0.17
 """Between two numbers of shots, in rows."""
 
@@ -67,7 +65,7 @@ def _draw(axis: Axes, rows: Sequence[str], cells: Sequence[Cell]) -> None:
     shots = sorted({of.shots for of in cells})
     for index, count in enumerate(shots):
         own = [of for of in cells if of.shots == count]
-        look = {"color": colour_of(index), "fmt": MARKERS[index % len(MARKERS)], "markersize": 5, "capsize": 3}
+        look = {"color": colour_of(index), "fmt": marker_of(index), "markersize": 5, "capsize": 3}
         y = [rows.index(of.row) + APART * (index - (len(shots) - 1) / 2) for of in own]
         below = [of.mean - (of.mean if of.low is None else of.low) for of in own]
         above = [(of.mean if of.high is None else of.high) - of.mean for of in own]

@@ -4,30 +4,19 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, PathPatch, Rectangle
 from matplotlib.path import Path as Outline
 
 from services.reporting.choices import Choices, Timeline
-from services.reporting.drawing import INK, Picture, colour_of, drawn, panels
+from services.reporting.drawing import INK, Picture, colour_of, drawn, ink_on, legend_of_markers, marker_of, panels
 from services.reporting.usage import Usage, segments
 
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
-"""By these sub-skills are told apart where there is no room for a number."""
 LEGIBLE = 0.05
 """A stretch gets its number, a bar its share, from this part of the width on."""
 STRIP = 0.84
 """Height of a strip, where one takes turns with the next every 1."""
 MOST_CELLS = 6
 """With more sub-skills than that, the cells of a matrix are left without numbers: a table has them."""
-
-
-def on_colour(colour: str) -> str:
-    """Return black or white, whichever is better read on a colour: by the luminance of WCAG 2."""
-    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in to_rgb(colour)]
-    return "black" if np.dot([0.2126, 0.7152, 0.0722], linear) > 0.179 else "white"
 
 
 def draw_timelines(title: str, shown: Sequence[Choices], on: str, most: int) -> Picture:
@@ -60,7 +49,9 @@ def draw_timelines(title: str, shown: Sequence[Choices], on: str, most: int) -> 
             axis.set_xlabel("step")
         for axis in axes[::2]:
             axis.set_ylabel("demonstration" if "demonstration" in on else "episode")
-        _legend(figure, max(choice.sub_skills for choice in shown))
+        names = _names(shown)
+        patches = [Patch(color=colour_of(k)) for k in range(len(names))]
+        figure.legend(patches, names, loc="outside lower center", ncols=min(len(names), 6), frameon=False)
         return drawn(figure, title, _told(shown, on))
 
 
@@ -115,7 +106,7 @@ def draw_usage(title: str, shown: Sequence[Choices], kinds: Sequence[str]) -> Pi
             axis.grid(visible=False, axis="y" if axis is not shares else "both")
         short = {"held-out demonstrations": "demonstrations"}
         shares.set_yticks(places, [f"{c.run}, {c.adaptation}, {short.get(on, on)}" for c, on, _ in rows])
-        _legend(figure, max(choice.sub_skills for choice in shown), marked=True)
+        legend_of_markers(figure, _names(shown))
         told = "; ".join(
             f"{choice.run} {choice.adaptation} adaptation in {on}: {_shares_in_words(use)}, {use.switches:.1f} "
             "switches per episode"
@@ -129,9 +120,7 @@ def _draw_shares(axis: Axes, place: int, use: Usage) -> None:
     for k, share in enumerate(use.shares):
         axis.barh(place, share, left=left, height=0.6, color=colour_of(k))
         if share >= LEGIBLE:
-            axis.text(
-                left + share / 2, place, str(k), ha="center", va="center", fontsize=7, color=on_colour(colour_of(k))
-            )
+            axis.text(left + share / 2, place, str(k), ha="center", va="center", fontsize=7, color=ink_on(colour_of(k)))
         left += share
 
 
@@ -173,21 +162,8 @@ def _kept_in_words(followed: np.ndarray) -> str:
     )
 
 
-def marker_of(sub_skill: int) -> str:
-    """Return the marker of a sub-skill, the same in every picture."""
-    return MARKERS[sub_skill % len(MARKERS)]
-
-
-def _legend(figure: Figure, sub_skills: int, *, marked: bool = False) -> None:
-    """Name all sub-skills below a figure."""
-    handles = [
-        Line2D([], [], marker=marker_of(k), color=colour_of(k), linestyle="none")
-        if marked
-        else Patch(color=colour_of(k))
-        for k in range(sub_skills)
-    ]
-    names = [f"sub-skill {k}" for k in range(sub_skills)]
-    figure.legend(handles, names, loc="outside lower center", ncols=min(sub_skills, 6), frameon=False)
+def _names(shown: Sequence[Choices]) -> list[str]:
+    return [f"sub-skill {k}" for k in range(max(choice.sub_skills for choice in shown))]
 
 
 def _told(shown: Sequence[Choices], on: str) -> str:

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from dmil_core.statistics import interval_text
 from services.cli.arguments import parse
 from services.cli.progress import console
 from services.evaluation.comparison import DIGITS, Cell, Difference, Unpaired
+from services.evaluation.summary import markdown_rows
 from services.reporting.means import draw_means
 from services.storage.files import write_file
 from services.storage.run_folders import find_folder
@@ -21,6 +22,17 @@ from services.sweeps.compare import write_sweep_page
 from services.sweeps.folders import MARK, SweepFolder
 from services.sweeps.tables import Sample, Tables, column_of, comparison_of, tables_of
 from services.tracking.tracker import Tracker
+
+SAMPLE = ("sample", "suite", "seed", "status", "iterations", "held out", "settings")
+DIFFERENCE = ("row", "against", "where", "difference", "95% interval", "pairs", "seeds", "differs?")
+
+
+def _where(of: Cell | Difference | Unpaired) -> str:
+    return f"{of.suite}, {of.split}, {of.shots}-shot"
+
+
+def _in_use(cell: Cell) -> str:
+    return "" if cell.sub_skills_in_use is None else f"{cell.sub_skills_in_use:.1f}"
 
 
 def _grid(tables: Tables) -> dict[str, dict[str, Cell]]:
@@ -49,8 +61,8 @@ def _lines(found: Cell | None, digits: int) -> list[str]:
     lines = _figures(found, digits)
     if found.environment_steps:
         lines.append(f"{found.environment_steps:,} environment steps")
-    if found.sub_skills_in_use is not None:
-        lines.append(f"{found.sub_skills_in_use:.1f} sub-skills in use")
+    if in_use := _in_use(found):
+        lines.append(f"{in_use} sub-skills in use")
     plural = "seed" if len(found.seeds) == 1 else "seeds"
     return [*lines, f"{len(found.seeds)} {plural}, {found.episodes} episodes"]
 
@@ -75,7 +87,7 @@ def show(tables: Tables, sweep: SweepFolder) -> None:
             view.add_row(row, *["\n".join(_lines(grid[row].get(column), digits)) for column in tables.columns])
         console.print(view)
     if tables.differences:
-        view = Table("row", "against", "where", "difference", "95% interval", "pairs", "seeds", "differs?")
+        view = Table(*DIFFERENCE)
         for found in tables.differences:
             view.add_row(*_difference_fields(found, digits))
         console.print(view)
@@ -88,7 +100,7 @@ def show(tables: Tables, sweep: SweepFolder) -> None:
 
 
 def _samples_view(tables: Tables) -> Table:
-    view = Table("sample", "suite", "seed", "status", "iterations", "held out", "settings", title=_head(tables))
+    view = Table(*SAMPLE, title=_head(tables))
     for sample in tables.samples:
         view.add_row(*_sample_fields(sample))
     return view
@@ -101,15 +113,13 @@ def _sample_fields(sample: Sample) -> list[str]:
 
 
 def _difference_fields(found: Difference, digits: int) -> list[str]:
-    where = f"{found.suite}, {found.split}, {found.shots}-shot"
     interval = interval_text(found.low, found.high, digits, "+")
-    fields = [found.row, found.baseline, where, f"{found.mean:+.{digits}f}", interval]
+    fields = [found.row, found.baseline, _where(found), f"{found.mean:+.{digits}f}", interval]
     return [*fields, str(found.pairs), str(len(found.seeds)), found.differs]
 
 
 def _not_compared(found: Unpaired) -> str:
-    where = f"{found.suite}, {found.split}, {found.shots}-shot"
-    return f"Not compared: {found.row} with {found.baseline} ({where}): {found.why}"
+    return f"Not compared: {found.row} with {found.baseline} ({_where(found)}): {found.why}"
 
 
 def write_tables(sweep: SweepFolder) -> Tables:
@@ -153,35 +163,23 @@ def _markdown(tables: Tables) -> str:
     digits, grid = DIGITS[tables.metric], _grid(tables)
     lines = [_head(tables) + ".", "", f"Begun {tables.began}, commit {tables.commit[:12]}: `{tables.command}`", ""]
     if tables.samples:
-        lines += _rows(["sample", "suite", "seed", "status", "iterations", "held out", "settings"])
-        lines += [_row(_sample_fields(sample)) for sample in tables.samples]
+        lines += markdown_rows(SAMPLE, map(_sample_fields, tables.samples))
     else:
-        lines += _rows(["", *tables.columns])
-        for row in tables.rows:
-            lines.append(_row([row, *["<br>".join(_lines(grid[row].get(c), digits)) for c in tables.columns]]))
+        rows = ([row, *["<br>".join(_lines(grid[row].get(c), digits)) for c in tables.columns]] for row in tables.rows)
+        lines += markdown_rows(["", *tables.columns], rows)
     if tables.cells:
         lines += ["", "Interquartile means over tasks and seeds; sub-skills with over a tenth of a task's states:", ""]
-        lines += _rows(["row", "where", "interquartile mean", "sub-skills in use", "interval"])
-        for found in tables.cells:
-            where = f"{found.suite}, {found.split}, {found.shots}-shot"
-            middle = f"{found.interquartile_mean:.{digits}f}"
-            in_use = "" if found.sub_skills_in_use is None else f"{found.sub_skills_in_use:.1f}"
-            lines.append(_row([found.row, where, middle, in_use, found.interval]))
+        rows = (
+            [cell.row, _where(cell), f"{cell.interquartile_mean:.{digits}f}", _in_use(cell), cell.interval]
+            for cell in tables.cells
+        )
+        lines += markdown_rows(["row", "where", "interquartile mean", "sub-skills in use", "interval"], rows)
     if tables.differences:
         lines += ["", "On the same seeds and episodes:", ""]
-        lines += _rows(["row", "against", "where", "difference", "95% interval", "pairs", "seeds", "differs?"])
-        lines += [_row(_difference_fields(found, digits)) for found in tables.differences]
+        lines += markdown_rows(DIFFERENCE, (_difference_fields(found, digits) for found in tables.differences))
     lines += [f"\n{_not_compared(found)}" for found in tables.unpaired]
     lines += [f"\nFailed: {name}: {' '.join(error.split())}" for name, error in tables.failed.items()]
     return "\n".join(lines) + "\n"
-
-
-def _rows(head: Sequence[str]) -> list[str]:
-    return [_row(head), _row(["---"] * len(head))]
-
-
-def _row(fields: Iterable[str]) -> str:
-    return f"| {' | '.join(field.replace('|', '/') for field in fields)} |"
 
 
 _TEX = str.maketrans(

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from matplotlib import colormaps
 
-from services.reporting.heat_map import COLOURS, heat_map, ink_on
+from services.reporting.drawing import ink_on
+from services.reporting.heat_map import COLOURS, heat_map
 
 
 def luminance(colour: str) -> float:

@@ -14,10 +14,10 @@ from services.evaluation.results import EpisodeResult, read_rows
 from services.experiments.finished_run import FinishedRun
 from services.reporting import sub_skill_report
 from services.reporting.choices import DEMONSTRATIONS, ROLLOUTS, Choices, Timeline, choices_on
-from services.reporting.drawing import COLOURS, Picture, colour_of
+from services.reporting.drawing import COLOURS, Picture, colour_of, ink_on
 from services.reporting.lineup import line_up, policies
 from services.reporting.page import DataTable
-from services.reporting.sub_skill_pictures import draw_timelines, draw_transitions, draw_usage, on_colour
+from services.reporting.sub_skill_pictures import draw_timelines, draw_transitions, draw_usage
 from services.reporting.sub_skills import sub_skill_sections
 
 TASK = "blue-green-red"
@@ -152,7 +152,7 @@ def test_numbers_are_legible_on_every_colour():
         return float(np.dot([0.2126, 0.7152, 0.0722], linear))
 
     for colour in COLOURS:
-        under, over = luminance(colour), {"black": 0.0, "white": 1.0}[on_colour(colour)]
+        under, over = luminance(colour), {"#000000": 0.0, "#ffffff": 1.0}[ink_on(colour)]
         assert (max(under, over) + 0.05) / (min(under, over) + 0.05) >= 4.5
 
 
