@@ -69,12 +69,12 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
         "if self.held_out >= self.per_task": "if self.held_out > self.per_task",
     },
     ("services/distributed/actor_pool.py", "services/distributed/test_actor_pool.py"): {
-        "suspect = worker.calls[0]": "suspect = worker.calls[-1]",
-        "if suspect.deaths >= DEATHS_ALLOWED": "if suspect.deaths > DEATHS_ALLOWED",
+        "suspect = worker.in_flight[0]": "suspect = worker.in_flight[-1]",
+        "if suspect.deaths >= MAX_DEATHS": "if suspect.deaths > MAX_DEATHS",
     },
     ("services/storage/checkpoints.py", "services/storage/test_checkpoints.py"): {
         'exclude={"loss", "mlflow_run_id"}': 'exclude={"loss"}',
-        "if path < whole[-self.kept] and not needed": "if path < whole[-self.kept]",
+        " and path != best": "",
         "for path in reversed(paths)": "for path in paths",
     },
     ("services/storage/remote.py", "services/storage/test_remote.py"): {
