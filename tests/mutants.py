@@ -5,6 +5,7 @@
 """
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -173,9 +174,9 @@ def caught_by(mutation: Mutation, tree: Path) -> str | None:
         return "the time limit"
     finally:
         file.write_text(sound)
-    failed = [line.split()[1] for line in ran.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+    failed = re.findall(r"^(?:FAILED|ERROR) \S*?(\w+)(?=\[| |$)", ran.stdout, re.MULTILINE)
     assert failed or ran.returncode == 0, ran.stdout[-2000:] + ran.stderr[-2000:]
-    return failed[0].partition("::")[2] or failed[0] if failed else None
+    return failed[0] if failed else None
 
 
 def main(copies: int = COPIES) -> None:

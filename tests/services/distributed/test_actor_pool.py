@@ -151,10 +151,9 @@ def test_calls_that_wait_behind_a_deadly_one_are_not_suspected(make, counter: Wo
     pool.close()
 
 
-@pytest.mark.alone
 def test_a_hung_actor_is_overtaken(make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture):
     """Both where others wait for what it makes, and where it is the only one."""
-    monkeypatch.setattr("services.distributed.stragglers.MIN_TIMEOUT_SECONDS", 0.5)
+    monkeypatch.setattr("services.distributed.stragglers.MIN_TIMEOUT_SECONDS", 4.0)  # longer than a busy machine takes
     for size in (1, 2):
         counter = WorkerCounter("counter", Meter())
         pool = Pool(make, size, max_in_flight=2, listener=counter)
@@ -173,7 +172,6 @@ def test_a_hung_actor_is_overtaken(make, monkeypatch: pytest.MonkeyPatch, caplog
         pool.close()
 
 
-@pytest.mark.alone
 def test_where_the_slow_actor_is_first_its_answer_counts(
     make, counter: WorkerCounter, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -42,12 +42,14 @@ def small(config: ExperimentConfig, store: DemoStore) -> Experiment:
 # Killed and hung
 
 
-@pytest.mark.alone
 @pytest.mark.usefixtures("joined")
-@pytest.mark.parametrize("how", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize(
+    "how", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=[pytest.mark.thorough, pytest.mark.alone])]
+)
 def test_a_lost_learner_changes_nothing(small: Experiment, data, how: int, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("services.distributed.stragglers.MIN_OUTSIDE_TIMEOUT_SECONDS", 2.0)
-    monkeypatch.setattr("services.distributed.stragglers.INITIAL_TIMEOUT_SECONDS", 20.0)
+    if how == signal.SIGSTOP:
+        monkeypatch.setattr("services.distributed.stragglers.MIN_OUTSIDE_TIMEOUT_SECONDS", 2.0)
+        monkeypatch.setattr("services.distributed.stragglers.INITIAL_TIMEOUT_SECONDS", 20.0)
     wanted = alone(small, data)
     with open_runner("ray", small.suite, 2) as runner:
         meta_training = runner.meta_train(plan_of(small, data))
@@ -105,7 +107,6 @@ def test_a_hung_worker_is_overtaken_and_the_log_says_so(
     assert "a backup runs it too" in caplog.text
 
 
-@pytest.mark.alone
 @pytest.mark.usefixtures("joined")
 def test_a_slot_that_ends_its_workers_is_named(small: Experiment, data):
     class Deadly(Dmil):
@@ -241,7 +242,6 @@ def test_an_error_is_told_with_the_command_that_repeats_it(
         reproduce.run([command])
 
 
-@pytest.mark.alone
 @pytest.mark.usefixtures("joined")
 def test_an_error_in_a_worker_arrives_whole(small: Experiment, data):
     class Failing(Dmil):
