@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmil_core.configs import TrainingConfig
-from dmil_core.outer_loop import BLOCKS_PER_WORKER, OuterState, OuterStep, add, blocks, tree_sum
+from dmil_core.outer_loop import BLOCKS_PER_WORKER, OuterState, OuterStep, add, blocks, tasks_of, tree_sum
 
 
 def gradients_of(seed: int, count: int) -> list[np.ndarray]:
@@ -22,6 +22,16 @@ def reduce(gradients: list[np.ndarray], fan_in: int) -> np.ndarray:
     while len(gradients) > 1:
         gradients = [add(gradients[first : first + fan_in]) for first in range(0, len(gradients), fan_in)]
     return gradients[0]
+
+
+@given(seed=st.integers(0, 2**31), slots=st.integers(1, 40), tasks=st.integers(1, 12))
+def test_every_task_comes_once_before_any_comes_again(seed: int, slots: int, tasks: int):
+    names = [str(task) for task in range(tasks)]
+    batch = tasks_of(3, names, seed, slots)
+    assert len(batch) == slots
+    rounds = [batch[first : first + tasks] for first in range(0, slots, tasks)]
+    assert all(len(set(each)) == len(each) for each in rounds)
+    assert batch == tasks_of(3, names, seed, slots)
 
 
 @given(seed=st.integers(0, 2**31), count=st.integers(1, 40), fan_in=st.sampled_from([2, 4, 8, 16]))
@@ -38,7 +48,7 @@ def test_a_fan_in_that_is_no_power_of_two_does_not():
 
 
 @given(
-    seed=st.integers(0, 2**31), count=st.integers(1, 40), workers=st.integers(1, 5), fan_in=st.sampled_from([2, 4, 8])
+    seed=st.integers(0, 2**31), count=st.integers(1, 200), workers=st.integers(1, 5), fan_in=st.sampled_from([2, 4, 8])
 )
 def test_sums_of_blocks_add_up_to_the_bits_of_the_tree(seed: int, count: int, workers: int, fan_in: int):
     gradients = gradients_of(seed, count)
