@@ -34,7 +34,7 @@ class Problem(NamedTuple):
     plain: Callable[[torch.Tensor], torch.Tensor]
 
     @property
-    def loss_gradient(self) -> LossGradient:
+    def gradient(self) -> LossGradient:
         return loss_gradient(self.network, self.inputs, self.loss)
 
 

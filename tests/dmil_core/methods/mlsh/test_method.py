@@ -12,6 +12,7 @@ from dmil_core.demonstrations import DemonstrationError
 from dmil_core.losses import Steps
 from dmil_core.methods.base import FineTuning, MetaLearner
 from dmil_core.methods.mlsh import learning as mlsh
+from dmil_core.methods.mlsh import method as mlsh_method
 from dmil_core.methods.mlsh.config import MlshConfig
 from dmil_core.methods.mlsh.macro_steps import draw_batch, macro_steps
 from dmil_core.methods.mlsh.method import Mlsh
@@ -95,7 +96,7 @@ def test_parameters_minus_the_gradient_are_where_the_slot_arrived(demonstrations
             if "low.0.weight" in self.parameters:
                 learned.append(flatten({n: t.detach() for n, t in self.parameters.items()}))
 
-    monkeypatch.setattr(mlsh, "Learner", Watched)
+    monkeypatch.setattr(mlsh_method, "Learner", Watched)
     gradient = method.task_gradient(parameters, method.sample(demonstrations, 0, named_rng(0, "batch"))).gradient
     assert len(learned) == 1
     torch.testing.assert_close(flatten(parameters) - gradient, learned[-1], rtol=0, atol=1e-6)
@@ -126,7 +127,7 @@ def test_as_many_updates_as_asked_in_passes_over_each_batch(method, demonstratio
         batches.append(len(taken))
         return draw_batch(*arguments)
 
-    monkeypatch.setattr(mlsh, "Learner", Counted)
+    monkeypatch.setattr(mlsh_method, "Learner", Counted)
     monkeypatch.setattr(mlsh, "draw_batch", counted)
     method.adapt(method.initial_parameters(named_rng(0, "initial")), demonstrations[:1], FineTuning(updates, 1e-3))
     assert len(taken) == updates
