@@ -1,6 +1,7 @@
 """What holds for every source file of the project: nothing is unpickled, and a file's name says what is in it."""
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -131,3 +132,15 @@ def test_unpickling_is_found(source: str):
 )
 def test_safe_reading_is_let_through(source: str):
     assert list(unpickling(source)) == []
+
+
+@pytest.mark.parametrize(
+    "page", sorted([*PROJECT.glob("*.md"), *PROJECT.glob("docs/*.md")]), ids=lambda path: path.name
+)
+def test_files_that_a_page_names_exist(page: Path):
+    named = re.findall(
+        r"`((?:benchmarks|deploy|dmil_core|docs|services|tests|tune_configs)/[\w./-]+)`", page.read_text("utf-8")
+    )
+    made = ("deploy/secrets/",)  # by a script, for one machine alone
+    places = [name for name in named if "NAME" not in name and not name.startswith(made)]
+    assert [name for name in places if not (PROJECT / name).exists()] == []
