@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from dmil_core.errors import UserError
+from dmil_core.trajectories import Trajectory
 
 
 class DemonstrationError(UserError):
@@ -16,7 +17,13 @@ class DemonstrationError(UserError):
 
 
 @dataclass(frozen=True, eq=False)
-class Demonstration:
+class _Named:
+    id: str
+    task: str
+
+
+@dataclass(frozen=True, eq=False)
+class Demonstration(Trajectory, _Named):  # bases in this order: a constructor takes the fields of the last one first
     """One demonstrated trajectory of one task.
 
     Args:
@@ -29,11 +36,6 @@ class Demonstration:
         DemonstrationError: for no step at all, unequal lengths, a wrong rank, numbers that are not float32 or not
             finite. A single step can be learned from: it has no continuity, and counts in every other loss.
     """
-
-    id: str
-    task: str
-    observations: Float32[np.ndarray, "steps obs_dim"]
-    actions: Float32[np.ndarray, "steps action_dim"]
 
     def __post_init__(self) -> None:
         for field in ("observations", "actions"):
@@ -59,9 +61,6 @@ class Demonstration:
                 f"demonstration {self.id} of {self.task}: {len(self.observations)} observations for "
                 f"{len(self.actions)} actions; wanted one action for each observation"
             )
-
-    def __len__(self) -> int:
-        return len(self.observations)
 
     def window(self, start: int, steps: int) -> "Demonstration":
         """Return the part of `steps` steps from `start` on, without a copy; its id says where it was cut.

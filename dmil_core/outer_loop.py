@@ -12,9 +12,10 @@ from torch import Tensor
 from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import as_work_error
-from dmil_core.methods.base import MetaLearner, OnlineMetaLearner, Policy, Rollout, TaskGradient
+from dmil_core.methods.base import MetaLearner, OnlineMetaLearner, Policy, TaskGradient
 from dmil_core.networks import Parameters
 from dmil_core.seeding import named_rng, named_seed
+from dmil_core.trajectories import Rollout
 
 BLOCKS_PER_WORKER = 4
 """Blocks that each worker should find at least, so that a slow one takes fewer and the others do not wait."""

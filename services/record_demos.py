@@ -10,12 +10,12 @@ import tyro
 
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import UserError
+from dmil_core.trajectories import Episode
 from services.cli.arguments import exit_code, parse
 from services.cli.composition import suite_settings
 from services.cli.progress import console
 from services.demonstrations.external import FORMS, demonstrations
 from services.demonstrations.store import open_store
-from services.suites.base import Attempt
 from services.suites.registry import open_suite
 
 MOST = 10_000
@@ -46,7 +46,7 @@ def run(arguments: Sequence[str]) -> None:
     saved = store.save(
         dataset_id,
         given.task,
-        [_attempt(demonstration) for demonstration in recorded.demonstrations],
+        [_episode(demonstration) for demonstration in recorded.demonstrations],
         failed=0,
         settings={"protocol": suite.protocol, "source": given.source},
         algorithm="recorded",
@@ -58,10 +58,10 @@ def run(arguments: Sequence[str]) -> None:
     )
 
 
-def _attempt(demonstration: Demonstration) -> Attempt:
+def _episode(demonstration: Demonstration) -> Episode:
     """Return what the store takes; the observation after the last action, which no one needs, is the one before it."""
     observations = np.concatenate((demonstration.observations, demonstration.observations[-1:]))
-    return Attempt(0, [], None, observations, demonstration.actions)
+    return Episode(observations, demonstration.actions)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from torch import Tensor
 from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.networks import Parameters
 from dmil_core.settings import MethodConfig
+from dmil_core.trajectories import Rollout
 
 
 class Decision(NamedTuple):
@@ -171,19 +172,6 @@ class MetaLearner(Method[Config], Generic[Config, BatchT]):
         With ``outer_step == "average"`` it is the parameters before the slot's own steps minus those after. The
         metrics contain ``loss``, and ``sub_skill_share/K`` for each sub-skill.
         """
-
-
-class Rollout(NamedTuple):
-    """An episode of a policy in meta-training, or its first part."""
-
-    observations: Float32[np.ndarray, "steps+1 obs_dim"]
-    actions: Float32[np.ndarray, "steps action_dim"]
-    """As the policy chose them; the environment clips them."""
-    sub_skills: Int64[np.ndarray, " steps"]
-    success: bool
-    """An episode ends with its first success."""
-    ended: bool
-    """Whether the episode ended, by success or at its horizon, and was not cut off."""
 
 
 class OnlineMetaLearner(MetaLearner[Config, BatchT]):

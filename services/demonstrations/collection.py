@@ -6,6 +6,7 @@ from contextlib import closing
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import DemonstrationError
+from dmil_core.trajectories import Episode
 from services.cli.live_view import Status
 from services.cli.progress import Bar
 from services.demonstrations.external import check_dimensions, demonstrations, places_of
@@ -13,7 +14,7 @@ from services.demonstrations.store import DemoStore, TaskDemonstrations
 from services.distributed.failures import keeping_failures
 from services.distributed.runner import Runner
 from services.distributed.work_items import ExpertAttempts
-from services.suites.base import Attempt, TaskSuite
+from services.suites.base import TaskSuite
 
 CHUNK = 10
 """Attempts of an expert in one call to a simulation worker."""
@@ -113,12 +114,12 @@ class DemonstrationCollection:
                 )
         return found
 
-    def _attempt(self, runner: Runner, tasks: Sequence[str]) -> Generator[tuple[str, list[Attempt]]]:
+    def _attempt(self, runner: Runner, tasks: Sequence[str]) -> Generator[tuple[str, list[Episode]]]:
         """Yield each task's attempts as soon as enough are successes, in the order of their numbers."""
         if not tasks:
             return
         settings = self._config.demonstrations
-        attempts: dict[str, list[Attempt]] = {task: [] for task in tasks}
+        attempts: dict[str, list[Episode]] = {task: [] for task in tasks}
 
         def lacking(task: str) -> int:
             return settings.per_task - sum(attempt.solved_at is not None for attempt in attempts[task])
@@ -141,7 +142,7 @@ class DemonstrationCollection:
                     for start in range(first, first + lacking(task), CHUNK):
                         numbers = range(start, min(start + CHUNK, first + lacking(task)))
                         items.append(ExpertAttempts(task, numbers, settings))
-                results: dict[int, list[Attempt]] = {}
+                results: dict[int, list[Episode]] = {}
                 left = Counter(item.task for item in items)
                 with keeping_failures(self._store.root, self._config):
                     for index, made in runner.simulate(items):

@@ -26,11 +26,12 @@ from pydantic import BaseModel, Field, ValidationError
 from dmil_core.configs import DemonstrationConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError, digest
 from dmil_core.errors import explain
+from dmil_core.trajectories import Episode
 from services.cli.progress import console
 from services.storage.checksums import check_listing, write_listing
 from services.storage.files import inside, read_file, room_for, sync
 from services.storage.remote import Storage, given_storage
-from services.suites.base import Attempt, TaskSuite
+from services.suites.base import TaskSuite
 
 LIBRARIES = ("gymnasium", "gymnasium-robotics", "metaworld", "minari", "mujoco", "numpy")
 DIGESTS, ARRAYS, METADATA = "SHA256SUMS", "data/main_data.hdf5", "data/metadata.json"
@@ -136,7 +137,7 @@ class DemoStore:
         self,
         dataset_id: str,
         task: str,
-        successes: Sequence[Attempt],
+        successes: Sequence[Episode],
         failed: int,
         settings: dict[str, Any],
         algorithm: str = "scripted expert",
@@ -212,7 +213,7 @@ def open_store() -> DemoStore:
     return DemoStore(data_root(), given_storage())
 
 
-def _write(folder: Path, successes: Sequence[Attempt], metadata: dict[str, Any]) -> None:
+def _write(folder: Path, successes: Sequence[Episode], metadata: dict[str, Any]) -> None:
     """Write a Minari data set and the digests of its files."""
     storage = MinariStorage.new(
         folder / "data",
@@ -226,7 +227,7 @@ def _write(folder: Path, successes: Sequence[Attempt], metadata: dict[str, Any])
         sync(folder / name)
 
 
-def _bytes_on_disk(successes: Sequence[Attempt]) -> int:
+def _bytes_on_disk(successes: Sequence[Episode]) -> int:
     """Return about what a data set takes: rewards and ends of episodes are 10 bytes a step."""
     states = sum(attempt.observations.nbytes + attempt.actions.nbytes for attempt in successes)
     steps = sum(len(attempt.actions) for attempt in successes)
@@ -269,7 +270,7 @@ def _box(observations: np.ndarray) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(-np.inf, np.inf, observations.shape[1:], np.float32)
 
 
-def _episode(attempt: Attempt) -> EpisodeBuffer:
+def _episode(attempt: Episode) -> EpisodeBuffer:
     steps = len(attempt.actions)
     return EpisodeBuffer(
         seed=attempt.seed,

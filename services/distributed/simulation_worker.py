@@ -5,8 +5,9 @@ from typing import Protocol, TypeVar
 import torch
 
 from dmil_core.errors import as_work_error
-from dmil_core.methods.base import Policy, Rollout
-from services.rollouts.episodes import collect_rollouts, episodes_beside
+from dmil_core.methods.base import Policy
+from dmil_core.trajectories import Rollout
+from services.rollouts.episodes import collect_rollouts, parallel_episodes
 from services.suites.base import Environment, TaskSuite, build_env
 
 ENVIRONMENTS_KEPT = 40
@@ -64,5 +65,5 @@ class SimulationWorker:
 
     def collect_rollouts(self, policy: Policy, task: str, seed: int, steps: int) -> list[Rollout]:
         """Let a policy act in a task for so many steps, see `services.rollouts.episodes.collect_rollouts`."""
-        envs = self.environments(task, episodes_beside(steps, self.suite.horizon))
+        envs = self.environments(task, parallel_episodes(steps, self.suite.horizon))
         return collect_rollouts(policy, envs, seed, steps, self.suite.horizon)

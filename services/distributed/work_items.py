@@ -13,11 +13,17 @@ from dmil_core.errors import as_work_error
 from dmil_core.methods.base import Method
 from dmil_core.networks import Parameters, unflatten
 from dmil_core.seeding import named_seed
+from dmil_core.trajectories import Episode
 from services.distributed.simulation_worker import SimulationWorker
-from services.rollouts.adaptations import Adaptation, AdaptationOutcome, Imitation, imitate, try_out
+from services.rollouts.adaptations import (
+    Adaptation,
+    AdaptationOutcome,
+    ImitationErrors,
+    evaluate_adaptation,
+    imitation_errors,
+)
 from services.rollouts.episodes import demonstrate
 from services.rollouts.verification import VerificationRow, verify
-from services.suites.base import Attempt
 
 
 @dataclass(frozen=True)
@@ -38,7 +44,7 @@ class ExpertAttempts:
         """The first of its attempts, which identifies it in ``failure.json``."""
         return {"task": self.task, "attempt": self.numbers[0]}
 
-    def run(self, worker: SimulationWorker) -> list[Attempt]:
+    def run(self, worker: SimulationWorker) -> list[Episode]:
         """Return the attempts.
 
         Raises:
@@ -114,7 +120,7 @@ class AdaptationRollouts(AdaptationItem):
     def run(self, worker: SimulationWorker) -> AdaptationOutcome:
         """Adapt, and run the episodes."""
         envs, horizon = worker.environments(self.adaptation.task, len(self.adaptation.episodes)), worker.suite.horizon
-        return try_out(
+        return evaluate_adaptation(
             self.method, self.parameters(), self.adaptation, self.held_out(), envs, horizon, self.evaluation, self.seed
         )
 
@@ -122,6 +128,6 @@ class AdaptationRollouts(AdaptationItem):
 class AdaptationImitation(AdaptationItem):
     """Judges an adapted policy by its distance from demonstrations."""
 
-    def run(self, worker: SimulationWorker) -> Imitation:
+    def run(self, worker: SimulationWorker) -> ImitationErrors:
         """Adapt, and compare the policy with demonstrations; nothing is simulated."""
-        return imitate(self.method, self.parameters(), self.adaptation, self.held_out(), self.evaluation)
+        return imitation_errors(self.method, self.parameters(), self.adaptation, self.held_out(), self.evaluation)

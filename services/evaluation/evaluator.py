@@ -19,7 +19,7 @@ from services.distributed.runner import Runner, Simulation
 from services.distributed.work_items import AdaptationItem, AdaptationRollouts
 from services.evaluation.results import AdaptationResult, EpisodeResult, ImitationResult, write_rows
 from services.evaluation.summary import Evaluation, cells, rates, sub_skill_use
-from services.rollouts.adaptations import Adaptation, AdaptationOutcome, Imitation, plan_adaptations
+from services.rollouts.adaptations import Adaptation, AdaptationOutcome, ImitationErrors, plan_adaptations
 from services.storage.checkpoints import Checkpoint, Checkpoints, iteration_of
 from services.storage.provenance import library_versions
 from services.suites.base import Split, TaskSuite
@@ -110,7 +110,7 @@ class Evaluator:
         suite = self._suite
         return Evaluation(checkpoint, suite.protocol, suite.best_score, failed, held, episodes, adaptations)
 
-    def imitation(self, checkpoint: Checkpoint, outcomes: Iterable[Imitation]) -> list[ImitationResult]:
+    def imitation(self, checkpoint: Checkpoint, outcomes: Iterable[ImitationErrors]) -> list[ImitationResult]:
         """Return a row for each adaptation, from their `AdaptationImitation` in order."""
         return [
             ImitationResult.model_validate(
@@ -244,7 +244,7 @@ def _finite(error: float | None) -> float | None:
 
 def _episode_rows(row: Mapping[str, object], adaptation: Adaptation, outcome: AdaptationOutcome) -> list[EpisodeResult]:
     return [
-        EpisodeResult.model_validate({**row, "episode": number, **episode.outcome})
+        EpisodeResult.model_validate({**row, "episode": number, **episode._asdict()})
         for number, episode in zip(adaptation.episodes, outcome.episodes, strict=True)
     ]
 

@@ -91,7 +91,7 @@ class Summary(BaseModel):
 
     method: str
     environment_steps: int
-    """Steps that meta-training took in the environments of its tasks, for methods that practise there."""
+    """Steps that an online method took in the environments of meta-training tasks."""
     rows: list[Cell]
     seconds: dict[str, float]
     sub_skills: dict[Split, SubSkillUse]

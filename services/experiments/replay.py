@@ -11,9 +11,11 @@ import torch
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import UserError
 from dmil_core.methods.base import FineTuning, Policy
+from dmil_core.trajectories import Rollout
 from services.evaluation.results import EpisodeResult
 from services.experiments.finished_run import FinishedRun
-from services.rollouts.recording import Film, Footage, Watched, watch, watch_expert
+from services.rollouts.adaptations import EpisodeOutcome
+from services.rollouts.recording import Recording, VideoSettings, record_expert, record_rollouts
 from services.suites.base import Environment, build_env
 
 
@@ -21,27 +23,23 @@ class ReplayError(UserError):
     """An episode or a demonstration that cannot be run again."""
 
 
-class Seen(NamedTuple):
-    """An episode's row, and what was seen when it was run again."""
+class ReplayedEpisode(NamedTuple):
+    """An episode's row, and the rollout and the recording of it that was run again."""
 
     row: EpisodeResult
-    watched: Watched
-
-    @property
-    def footage(self) -> Footage:
-        """What was to be seen."""
-        return self.watched.footage
+    rollout: Rollout
+    recording: Recording
 
     @property
     def difference(self) -> str | None:
-        """What came otherwise than the row says, in words: on another machine, or with other versions, it may."""
-        episode, row = self.watched.episode, self.row
+        """The first difference from the row, in words: on another machine, or with other versions, there may be one."""
+        outcome, row = EpisodeOutcome.of(self.rollout), self.row
         for name in ("success", "score", "steps"):
-            if (got := getattr(episode, name)) != (wanted := getattr(row, name)):
+            if (got := getattr(outcome, name)) != (wanted := getattr(row, name)):
                 return (
                     f"episode {row.episode} of {row.task}, {row.shots}-shot: {name} {got}, where the run had {wanted}"
                 )
-        if tuple(episode.sub_skill_steps) != row.sub_skill_steps:
+        if tuple(outcome.sub_skill_steps) != row.sub_skill_steps:
             return f"episode {row.episode} of {row.task}, {row.shots}-shot: other sub-skills than in the run"
         return None
 
@@ -53,33 +51,36 @@ class Replay:
     run: FinishedRun
     _envs: dict[str, list[Environment]] = field(default_factory=dict)
 
-    def rerun(self, row: EpisodeResult, film: Film | None = None, filmed: Sequence[int] = ()) -> list[Seen]:
+    def rerun(
+        self, row: EpisodeResult, video: VideoSettings | None = None, filmed: Sequence[int] = ()
+    ) -> list[ReplayedEpisode]:
         """Adapt as for the episode of `row`, and run all episodes of that adaptation, side by side as they were.
 
         Args:
             row: of any episode of the adaptation.
-            film: how episodes are filmed.
+            video: how episodes are filmed.
             filmed: the numbers of those that are.
 
         Raises:
             ReplayError: if the checkpoint or the demonstrations are not those of the row.
-            RenderingError: if there is nothing here to draw with.
+            RenderingError: if OpenGL does not work here.
         """
         rows = [other for other in self.run.episodes if _adaptation(other) == _adaptation(row)]
         policy = self._policy(row)
-        films: Mapping[int, Film] = {
-            place: film for place, other in enumerate(rows) if film is not None and other.episode in filmed
+        videos: Mapping[int, VideoSettings] = {
+            place: video for place, other in enumerate(rows) if video is not None and other.episode in filmed
         }
         envs = self._environments(row.task, len(rows))
-        watched = watch(policy, envs, [other.seed for other in rows], self.run.experiment.suite.horizon, films)
-        return [Seen(*pair) for pair in zip(rows, watched, strict=True)]
+        seeds = [other.seed for other in rows]
+        recorded = record_rollouts(policy, envs, seeds, self.run.experiment.suite.horizon, videos)
+        return [ReplayedEpisode(row, *pair) for row, pair in zip(rows, recorded, strict=True)]
 
-    def demonstration(self, row: EpisodeResult, film: Film) -> tuple[Demonstration, Footage]:
+    def demonstration(self, row: EpisodeResult, video: VideoSettings) -> tuple[Demonstration, Recording]:
         """Film the first demonstration of an episode's support set: its expert acts once more from its seed.
 
         Raises:
             ReplayError: if it has no seed, or something else comes of it here.
-            RenderingError: if there is nothing here to draw with.
+            RenderingError: if OpenGL does not work here.
         """
         experiment, suite = self.run.experiment, self.run.experiment.suite
         settings = experiment.config.demonstrations
@@ -95,13 +96,13 @@ class Replay:
         seed = experiment.store.seed_of(data.id, place)
         (env,) = self._environments(row.task, 1)
         steps = settings.steps(row.task, suite.horizon)
-        attempt, footage = watch_expert(expert, env, seed, steps, settings, film)
-        if not np.array_equal(attempt.observations[:-1], wanted.observations):
+        episode, recording = record_expert(expert, env, seed, steps, settings, video)
+        if not np.array_equal(episode.observations[:-1], wanted.observations):
             raise ReplayError(
                 f"{where}; its seed {seed} leads to something else here than when it was recorded; wanted the versions "
                 f"of that time, which {experiment.store.root / data.id} names in its metadata"
             )
-        return wanted, footage
+        return wanted, recording
 
     def _policy(self, row: EpisodeResult) -> Policy:
         run = self.run

@@ -13,7 +13,7 @@ from dmil_core.settings import sub_skills_of
 from services.experiments.finished_run import FinishedRun
 from services.reporting.lineup import Lineup, has_sub_skills, policies
 from services.reporting.usage import Usage, usage
-from services.rollouts.episodes import record
+from services.rollouts.episodes import rollout
 from services.suites.base import Environment, build_env
 
 DEMONSTRATIONS, ROLLOUTS = "held-out demonstrations", "rollouts"
@@ -74,13 +74,12 @@ def _acted(policy: Policy, run: FinishedRun, task: str, envs: Sequence[Environme
     """Let a policy act in the episodes of the evaluation's first support set."""
     if not envs:
         return []
-    episodes = [run.config.evaluation.support_draws * place for place in range(len(envs))]
-    seeds = [named_seed(run.config.seed, "evaluation", task, episode) for episode in episodes]
-    try:
-        recorded = record(policy, envs, seeds, horizon, horizon)
-    except FloatingPointError:
+    numbers = [run.config.evaluation.support_draws * place for place in range(len(envs))]
+    seeds = [named_seed(run.config.seed, "evaluation", task, number) for number in numbers]
+    rollouts = rollout(policy, envs, seeds, horizon)
+    if any(episode.diverged for episode in rollouts):
         return []
     return [
-        Timeline(f"{episode}{' solved' if rollout.success else ''}", rollout.sub_skills)
-        for episode, rollout in zip(episodes, recorded, strict=True)
+        Timeline(f"{number}{' solved' if episode.success else ''}", episode.sub_skills)
+        for number, episode in zip(numbers, rollouts, strict=True)
     ]

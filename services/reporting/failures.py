@@ -10,9 +10,9 @@ from jaxtyping import Float64
 
 from services.evaluation.results import EpisodeResult
 from services.experiments.finished_run import FinishedRun
-from services.experiments.replay import Replay, ReplayError, Seen, replaying
+from services.experiments.replay import Replay, ReplayedEpisode, ReplayError, replaying
 from services.reporting.drawing import Picture, colour_of, drawn, panels
-from services.reporting.film import FORMS, film_of, write_film
+from services.reporting.film import FORMS, video_settings, write_film
 from services.reporting.page import Clip, Commands, DataTable, Part, Prose, Section
 from services.reporting.video import camera_of, command, name_of, side_of
 from services.suites.base import Measure, measure_of
@@ -94,69 +94,71 @@ def _of_task(
     run, task = replay.run, rows[0].task
     adaptations = sorted(_grouped(rows, lambda row: row.draw), key=_rate)
     filmed = next(row for row in adaptations[0] if not row.success)
-    seen = _run_again(replay, adaptations, filmed if videos else None)
+    replayed = _run_again(replay, adaptations, filmed if videos else None)
     measure = measure_of(run.experiment.suite, task)
-    parts: list[Part] = [Prose(_told(rows, seen, measure))]
-    if measure is not None and (drawn_ones := [one for one in seen if _course(one, measure).size]):
-        parts.append(draw_episodes(drawn_ones, measure, run.experiment.suite.best_score))
+    parts: list[Part] = [Prose(_told(rows, replayed, measure))]
+    if measure is not None and (measured := [one for one in replayed if _course(one, measure).size]):
+        parts.append(draw_episodes(measured, measure, run.experiment.suite.best_score))
     if videos:
-        (one,) = [one for one in seen if one.row == filmed]
+        (one,) = [one for one in replayed if one.row == filmed]
         parts.append(_film(run, one))
     else:
         parts.append(Commands(f"To see one that failed in {task}", [command(run, filmed)]))
-    return parts, [_table_row(one, measure) for one in seen]
+    return parts, [_table_row(one, measure) for one in replayed]
 
 
 def _run_again(
     replay: Replay, adaptations: Sequence[Sequence[EpisodeResult]], filmed: EpisodeResult | None
-) -> list[Seen]:
+) -> list[ReplayedEpisode]:
     """Run whole adaptations, until there are enough episodes."""
-    film = None if filmed is None else film_of(camera_of(replay.run), filmed.steps, FORMS["mp4"])
-    seen: list[Seen] = []
+    video = None if filmed is None else video_settings(camera_of(replay.run), filmed.steps, FORMS["mp4"])
+    replayed: list[ReplayedEpisode] = []
     for adaptation in adaptations:
-        if len(seen) >= MOST_EPISODES:
+        if len(replayed) >= MOST_EPISODES:
             break
         numbers = [filmed.episode] if filmed is not None and filmed in adaptation else []
-        seen += replay.rerun(adaptation[0], film, numbers)
-    return sorted(seen, key=lambda one: one.row.episode)
+        replayed += replay.rerun(adaptation[0], video, numbers)
+    return sorted(replayed, key=lambda one: one.row.episode)
 
 
-def _course(seen: Seen, measure: Measure) -> Float64[np.ndarray, " steps"]:
+def _course(replayed: ReplayedEpisode, measure: Measure) -> Float64[np.ndarray, " steps"]:
     """Return the measure at each step: at none, if the policy had diverged before the first one."""
-    return seen.footage.numbers.get(measure.name, np.zeros(0))
+    return replayed.recording.infos.get(measure.name, np.zeros(0))
 
 
-def _told(rows: Sequence[EpisodeResult], seen: Sequence[Seen], measure: Measure | None) -> str:
+def _told(rows: Sequence[EpisodeResult], replayed: Sequence[ReplayedEpisode], measure: Measure | None) -> str:
     first = rows[0]
     solved = sum(row.success for row in rows)
     told = f"{first.task} ({first.split}), {first.shots}-shot: {solved} of {len(rows)} episodes were solved"
-    told += "." if len(seen) == len(rows) else f"; {len(seen)} of them were run again, the worst support sets first."
-    if differences := [one.difference for one in seen if one.difference is not None]:
+    if len(replayed) < len(rows):
+        told += f"; {len(replayed)} of them were run again, the worst support sets first"
+    told += "."
+    if differences := [one.difference for one in replayed if one.difference is not None]:
         told += f" {len(differences)} came out otherwise than in the run: {differences[0]}."
     if measure is None:
         told += " The suite does not measure how far an episode has come, only whether it is solved."
     return told
 
 
-def _table_row(seen: Seen, measure: Measure | None) -> list[str | int | float]:
-    row, episode = seen.row, seen.watched.episode
-    course = np.zeros(0) if measure is None else _course(seen, measure)
+def _table_row(replayed: ReplayedEpisode, measure: Measure | None) -> list[str | int | float]:
+    row, episode = replayed.row, replayed.rollout
+    course = np.zeros(0) if measure is None else _course(replayed, measure)
     numbers = (course[0], course.min(), course.max(), course[-1]) if course.size else ()
     told = [f"{number:.3g}" for number in numbers] or [""] * 4
     what = "none" if measure is None else measure.words
-    return [row.task, row.shots, row.episode, "yes" if episode.success else "no", episode.steps, what, *told]
+    return [row.task, row.shots, row.episode, "yes" if episode.success else "no", len(episode), what, *told]
 
 
-def draw_episodes(seen: Sequence[Seen], measure: Measure, best_score: int) -> Picture:
+def draw_episodes(replayed: Sequence[ReplayedEpisode], measure: Measure, best_score: int) -> Picture:
     """Draw how far episodes of one task have come at every step: a line each, failures told apart by more than colour.
 
     Args:
-        seen: the episodes.
+        replayed: the episodes.
         measure: of their task.
         best_score: of an episode in which all is done.
     """
-    row, scored = seen[0].row, measure.name == "score"
-    kinds = {success: [one for one in seen if one.watched.episode.success is success] for success in (True, False)}
+    row, scored = replayed[0].row, measure.name == "score"
+    kinds = {success: [one for one in replayed if one.rollout.success is success] for success in (True, False)}
     with panels(width=7.5, height=3.1) as (figure, (axis,)):
         for success, style, word in ((True, SOLVED, "solved"), (False, FAILED, "failed")):
             for place, one in enumerate(kinds[success]):
@@ -179,19 +181,19 @@ def draw_episodes(seen: Sequence[Seen], measure: Measure, best_score: int) -> Pi
         return drawn(figure, title, f"A line is an episode; a cross or a dot is its end{apart}. {told}")
 
 
-def _in_words(word: str, seen: Sequence[Seen], measure: Measure) -> str:
-    if not seen:
+def _in_words(word: str, replayed: Sequence[ReplayedEpisode], measure: Measure) -> str:
+    if not replayed:
         return f"None {word}."
-    courses = [_course(one, measure) for one in seen]
+    courses = [_course(one, measure) for one in replayed]
     first, low, high, last = np.mean([(own[0], own.min(), own.max(), own[-1]) for own in courses], axis=0)
     return (
-        f"{len(seen)} {word}: on average {first:.3g} at the first step, {low:.3g} at the smallest, {high:.3g} at the "
-        f"largest and {last:.3g} at the last."
+        f"{len(replayed)} {word}: on average {first:.3g} at the first step, {low:.3g} at the smallest, {high:.3g} at "
+        f"the largest and {last:.3g} at the last."
     )
 
 
-def _film(run: FinishedRun, seen: Seen) -> Clip:
-    side = side_of(run, seen)
-    path: Path = run.folder / "report" / "videos" / f"{name_of(seen.row)}.mp4"
+def _film(run: FinishedRun, replayed: ReplayedEpisode) -> Clip:
+    side = side_of(run, replayed)
+    path: Path = run.folder / "report" / "videos" / f"{name_of(replayed.row)}.mp4"
     write_film(path, [side])
     return Clip(f"{side.title}: {side.ending}", path)

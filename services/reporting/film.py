@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from services.reporting.drawing import colour_of
-from services.rollouts.recording import Film, Frame
+from services.rollouts.recording import Frame, VideoSettings
 from services.storage.files import write_file
 from services.suites.rendering import View
 
@@ -63,10 +63,10 @@ class Side(NamedTuple):
         return self.sub_skills[max(step - 1, 0)] if self.sub_skills else None
 
 
-def film_of(view: str | View, steps: int, form: Form) -> Film:
+def video_settings(view: str | View, steps: int, form: Form) -> VideoSettings:
     """Return how to film an episode of so many steps, so that it is no longer than it should be."""
     most = LONGEST_SECONDS * form.rate
-    return Film(view, max(1, int(np.ceil(steps / most))), form.height, form.width)
+    return VideoSettings(view, max(1, int(np.ceil(steps / most))), form.height, form.width)
 
 
 def compose(sides: Sequence[Side], rate: int) -> Iterator[UInt8[np.ndarray, "height width 3"]]:

@@ -297,9 +297,9 @@ def _flat(of: Contender) -> dict[str, str]:
 def _runs(comparison: Comparison) -> list[Part]:
     rows = []
     for of in comparison.contenders:
-        practised = f"{of.environment_steps:,}" if of.environment_steps else ""
+        steps_taken = f"{of.environment_steps:,}" if of.environment_steps else ""
         checkpoint = of.episodes[0].checkpoint[:12] if of.episodes else ""
         which = [of.name, of.row, of.suite, f"{of.seed}", of.config.method.name]
-        rows.append([*which, f"{of.config.training.iterations}", practised, checkpoint])
+        rows.append([*which, f"{of.config.training.iterations}", steps_taken, checkpoint])
     head = ["run", "row", "suite", "seed", "method", "iterations", "environment steps", "checkpoint"]
     return [_filled("Runs", head, rows)] if rows else []

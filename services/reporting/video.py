@@ -17,8 +17,8 @@ from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.evaluation.results import EpisodeResult
 from services.experiments.finished_run import FinishedRun
-from services.experiments.replay import Replay, Seen, replaying
-from services.reporting.film import FORMS, Form, FormName, Side, film_of, write_film
+from services.experiments.replay import Replay, ReplayedEpisode, replaying
+from services.reporting.film import FORMS, Form, FormName, Side, video_settings, write_film
 from services.suites.rendering import View
 
 
@@ -53,9 +53,9 @@ def run(arguments: Sequence[str]) -> None:
     if path.suffix != f".{given.format}":
         raise UserError(f"--output: got {path}; wanted a name that ends in .{given.format}, or another --format")
     with replaying(finished) as replay:
-        sides, seen = _sides(replay, row, FORMS[given.format], demonstration=given.demonstration)
-    if seen.difference is not None:
-        console.print(f"warning: {seen.difference}; the film shows what came of it here", markup=False)
+        sides, replayed = _sides(replay, row, FORMS[given.format], demonstration=given.demonstration)
+    if replayed.difference is not None:
+        console.print(f"warning: {replayed.difference}; the film shows what came of it here", markup=False)
     write_film(path, sides)
     console.print(f"{sides[-1].title}: {sides[-1].ending}", markup=False)
     console.print(f"{path}, {path.stat().st_size // 1024} KB", markup=False)
@@ -114,28 +114,31 @@ def camera_of(finished: FinishedRun) -> str | View:
     return camera
 
 
-def _sides(replay: Replay, row: EpisodeResult, form: Form, *, demonstration: bool) -> tuple[list[Side], Seen]:
+def _sides(
+    replay: Replay, row: EpisodeResult, form: Form, *, demonstration: bool
+) -> tuple[list[Side], ReplayedEpisode]:
     """Return what the film shows from left to right, and the episode that it is about."""
     camera = camera_of(replay.run)
-    film = film_of(camera, row.steps, form)
+    video = video_settings(camera, row.steps, form)
     sides = []
     if demonstration:
-        shown_first, footage = replay.demonstration(row, film)
-        steps = len(footage.actions)
+        shown_first, recording = replay.demonstration(row, video)
+        steps = len(shown_first)
         title = f"demonstration {shown_first.id} of {row.task}"
-        sides.append(Side(title, footage.frames, steps, None, True, f"demonstrated in {steps} steps"))
-    (seen,) = [seen for seen in replay.rerun(row, film, [row.episode]) if seen.row.episode == row.episode]
-    return [*sides, side_of(replay.run, seen)], seen
+        sides.append(Side(title, recording.frames, steps, None, True, f"demonstrated in {steps} steps"))
+    episodes = replay.rerun(row, video, [row.episode])
+    replayed = next(episode for episode in episodes if episode.row.episode == row.episode)
+    return [*sides, side_of(replay.run, replayed)], replayed
 
 
-def side_of(finished: FinishedRun, seen: Seen) -> Side:
+def side_of(finished: FinishedRun, replayed: ReplayedEpisode) -> Side:
     """Return an episode as a film shows it."""
-    episode, row = seen.watched.episode, seen.row
+    episode, row = replayed.rollout, replayed.row
     title = f"{row.task}, {row.shots}-shot, episode {row.episode}"
     score = f": {episode.score} of {best} sub-tasks" if (best := finished.experiment.suite.best_score) > 1 else ""
-    ending = f"{'solved' if episode.success else 'not solved'} in {episode.steps} steps{score}"
-    sub_skills = episode.sub_skills if sub_skills_of(finished.config.method) > 1 else None
-    return Side(title, seen.footage.frames, episode.steps, sub_skills, episode.success, ending)
+    ending = f"{'solved' if episode.success else 'not solved'} in {len(episode)} steps{score}"
+    sub_skills = episode.sub_skills.tolist() if sub_skills_of(finished.config.method) > 1 else None
+    return Side(title, replayed.recording.frames, len(episode), sub_skills, episode.success, ending)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,8 @@ from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import FineTuning, Method, Policy, SubSkillUse
 from dmil_core.networks import Parameters
 from dmil_core.seeding import named_seed
-from services.rollouts.episodes import Episode, rollout
+from dmil_core.trajectories import Rollout
+from services.rollouts.episodes import rollout
 from services.suites.base import Environment, Split
 
 
@@ -69,14 +70,32 @@ def plan_adaptations(tasks: Sequence[tuple[Split, str]], evaluation: EvaluationC
     ]
 
 
+class EpisodeOutcome(NamedTuple):
+    """What a result row holds of a rollout."""
+
+    seed: int
+    goal: list[float]
+    success: bool
+    score: int
+    steps: int
+    sub_skill_steps: list[int]
+    """Steps in which each sub-skill acted, up to the highest one that did."""
+
+    @classmethod
+    def of(cls, rollout: Rollout) -> "EpisodeOutcome":
+        """Leave out the trajectory."""
+        counts = np.bincount(rollout.sub_skills).tolist()
+        return cls(rollout.seed, rollout.goal, rollout.success, rollout.score, len(rollout), counts)
+
+
 class AdaptationOutcome(NamedTuple):
     """The episodes of an adaptation, and the sub-skills along the held-out demonstrations it did not adapt to."""
 
-    episodes: list[Episode]
+    episodes: list[EpisodeOutcome]
     use: list[SubSkillUse]
 
 
-def try_out(
+def evaluate_adaptation(
     method: Method,
     parameters: Parameters,
     adaptation: Adaptation,
@@ -103,11 +122,11 @@ def try_out(
     policy = method.adapt(parameters, support, FineTuning(evaluation.fine_tuning_steps, evaluation.learning_rate))
     seeds = [named_seed(seed, "evaluation", adaptation.task, episode) for episode in adaptation.episodes]
     others = [demonstration for demonstration in held_out if demonstration not in support]
-    episodes = rollout(policy, envs[: len(seeds)], seeds, horizon)
+    episodes = [EpisodeOutcome.of(episode) for episode in rollout(policy, envs, seeds, horizon)]
     return AdaptationOutcome(episodes, [policy.sub_skill_use(demonstration) for demonstration in others])
 
 
-class Imitation(NamedTuple):
+class ImitationErrors(NamedTuple):
     """The `imitation_error` of an adapted policy."""
 
     support: float
@@ -116,15 +135,15 @@ class Imitation(NamedTuple):
     """On the held-out demonstrations of the task that it was not adapted to, where there are any."""
 
 
-def imitate(
+def imitation_errors(
     method: Method,
     parameters: Parameters,
     adaptation: Adaptation,
     held_out: Sequence[Demonstration],
     evaluation: EvaluationConfig,
-) -> Imitation:
-    """Adapt to a support set and compare the policy with demonstrations: no episodes, else as `try_out`."""
+) -> ImitationErrors:
+    """Adapt to a support set and compare the policy with demonstrations: no episodes, else as `evaluate_adaptation`."""
     support = adaptation.support(held_out)
     policy = method.adapt(parameters, support, FineTuning(evaluation.fine_tuning_steps, evaluation.learning_rate))
     others = [demonstration for demonstration in held_out if demonstration not in support]
-    return Imitation(imitation_error(policy, support), imitation_error(policy, others) if others else None)
+    return ImitationErrors(imitation_error(policy, support), imitation_error(policy, others) if others else None)

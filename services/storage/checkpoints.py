@@ -66,7 +66,7 @@ class Manifest(BaseModel):
     """Names and shapes of the parameters, in the order in which they are laid out flat; none of a method that learns
     nothing."""
     environment_steps: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Taken in meta-training, by a method that practises."""
+    """Steps that an online method took in the environments of meta-training tasks."""
     data: dict[str, str]
     """The SHA-256 of each task's demonstrations."""
     versions: dict[str, str]

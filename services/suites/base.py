@@ -38,17 +38,6 @@ class Measure(NamedTuple):
     """What it is, with its unit."""
 
 
-class Attempt(NamedTuple):
-    """One attempt of an expert, a demonstration if it is a success."""
-
-    seed: int
-    goal: list[float]
-    solved_at: int | None
-    """The first step after which the task was solved."""
-    observations: Float32[np.ndarray, "steps+1 obs_dim"]
-    actions: Float32[np.ndarray, "steps action_dim"]
-
-
 class TaskSuite(Protocol):
     """Meta-training and meta-testing tasks of one kind of robot.
 

@@ -15,11 +15,11 @@ from torch.nn import functional
 
 from dmil_core.demonstrations import Normalisation
 from dmil_core.losses import Steps
-from dmil_core.methods.base import Rollout
 from dmil_core.methods.option_gail.config import OptionGailConfig
 from dmil_core.methods.option_gail.option_model import OptionModel, options_before
 from dmil_core.methods.ppo import clipped_surrogate, generalised_advantages
 from dmil_core.networks import Parameters, descend, mlp, network
+from dmil_core.trajectories import Rollout
 
 POLICY = ("high.", "low.", "log_deviations")
 """What the names of the option model's parameters begin with."""

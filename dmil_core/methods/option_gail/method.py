@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dmil_core.demonstrations import Demonstration
 from dmil_core.losses import Steps
-from dmil_core.methods.base import FineTuning, MetaLearner, OnlineMetaLearner, Rollout, TaskGradient
+from dmil_core.methods.base import FineTuning, MetaLearner, OnlineMetaLearner, TaskGradient
 from dmil_core.methods.option_gail.adversary import (
     POLICY,
     Played,
@@ -34,6 +34,7 @@ from dmil_core.methods.option_gail.option_model import (
 )
 from dmil_core.methods.option_gail.policy import OptionExplorationPolicy, OptionPolicy
 from dmil_core.networks import Parameters, descend, flatten, initialise, leaves, without_graph
+from dmil_core.trajectories import Rollout
 
 Phase = Literal["likelihood", "hard", "adversarial"]
 

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from dmil_core.demonstrations import Demonstration
-from dmil_core.methods.base import Rollout
 from dmil_core.methods.mil.config import MilConfig
 from dmil_core.methods.mlsh.config import MlshConfig
 from dmil_core.methods.option_gail.config import OptionGailConfig, OptionGailOfflineConfig
@@ -13,6 +12,7 @@ from dmil_core.methods.option_gail.method import OptionGail, OptionGailOffline
 from dmil_core.methods.option_gail.option_model import OptionModel
 from dmil_core.networks import Parameters
 from dmil_core.seeding import named_rng
+from dmil_core.trajectories import Rollout
 
 OFFLINE = OptionGailOfflineConfig(hidden_layers=2, hidden_units=8, trajectories=3, likelihood_iterations=2)
 PLAYING = OptionGailConfig(
@@ -75,9 +75,8 @@ def rollouts() -> list[Rollout]:
         Rollout(
             draw.normal(size=(steps + 1, 4)).astype(np.float32),
             draw.normal(size=(steps, 3)).astype(np.float32),
-            draw.integers(0, 3, steps),
-            success,
-            ended=True,
+            sub_skills=draw.integers(0, 3, steps),
+            solved_at=steps - 1 if success else None,
         )
         for steps, success in ((5, True), (1, False), (3, False))
     ]

@@ -11,10 +11,11 @@ import numpy as np
 
 from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration
-from dmil_core.methods.base import Decision, MetaLearner, Policy, Rollout
+from dmil_core.methods.base import Decision, MetaLearner, Policy
 from dmil_core.networks import Parameters, flatten, unflatten
 from dmil_core.outer_loop import CollectRollouts, OuterState, OuterStep, group_gradient, groups, tasks_of
 from dmil_core.seeding import named_rng
+from dmil_core.trajectories import Rollout
 
 STEPS, SPEED = 40, 0.05
 DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0]])
@@ -94,7 +95,13 @@ def collect_rollouts(policy: Policy, task: str, seed: int, steps: int) -> list[R
         ended = len(actions) == STEPS
         success = ended and bool(np.linalg.norm(place - expert) < 0.2)
         rollouts.append(
-            Rollout(np.array(places, np.float32), np.array(actions, np.float32), np.array(chosen), success, ended)
+            Rollout(
+                np.array(places, np.float32),
+                np.array(actions, np.float32),
+                solved_at=STEPS - 1 if success else None,
+                sub_skills=np.array(chosen),
+                ended=ended,
+            )
         )
     return rollouts
 

@@ -14,10 +14,10 @@ import pytest
 
 from dmil_core.configs import DemonstrationConfig, ExperimentConfig, SuiteConfig
 from dmil_core.demonstrations import DemonstrationError
+from dmil_core.trajectories import Episode
 from services.demonstrations.store import DemoStore, TaskDemonstrations
 from services.experiments.experiment import Experiment, open_runner
 from services.storage.checksums import write_listing
-from services.suites.base import Attempt
 from services.suites.metaworld import MetaWorldSuite
 from services.suites.registry import open_suite
 
@@ -25,10 +25,10 @@ ID = "reach/scripted-test-v0"
 
 
 @pytest.fixture
-def attempts() -> list[Attempt]:
+def attempts() -> list[Episode]:
     draw = np.random.default_rng(0)
     return [
-        Attempt(
+        Episode(
             seed=10 + length,
             goal=[0.5, float(length)],
             solved_at=length - 2,
@@ -40,11 +40,11 @@ def attempts() -> list[Attempt]:
 
 
 @pytest.fixture
-def saved(attempts: list[Attempt], tmp_path: Path) -> TaskDemonstrations:
+def saved(attempts: list[Episode], tmp_path: Path) -> TaskDemonstrations:
     return DemoStore(tmp_path).save(ID, "reach", attempts, failed=2, settings={"noise": 0.1})
 
 
-def test_what_is_saved_is_loaded_to_the_bit(saved: TaskDemonstrations, attempts: list[Attempt], tmp_path: Path):
+def test_what_is_saved_is_loaded_to_the_bit(saved: TaskDemonstrations, attempts: list[Episode], tmp_path: Path):
     loaded = DemoStore(tmp_path).load(ID, "reach")
     assert loaded is not None
     assert (loaded.id, loaded.failed, loaded.digest) == (ID, 2, saved.digest)
@@ -61,7 +61,7 @@ def test_nothing_is_loaded_before_it_is_collected(tmp_path: Path):
 
 
 @pytest.mark.usefixtures("saved")
-def test_minari_reads_it(attempts: list[Attempt], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_minari_reads_it(attempts: list[Episode], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     dataset = minari.load_dataset(ID)
     assert dataset.total_episodes == len(attempts)
@@ -197,7 +197,7 @@ def test_what_cannot_be_learned_from_is_refused_by_name(tmp_path: Path, edit, wo
     assert words in str(error.value)
 
 
-def test_a_demonstration_that_cannot_be_learned_from_is_not_written(attempts: list[Attempt], tmp_path: Path):
+def test_a_demonstration_that_cannot_be_learned_from_is_not_written(attempts: list[Episode], tmp_path: Path):
     attempts[1].observations[3, 2] = math.nan
     with pytest.raises(DemonstrationError, match="demonstration 001 of reach: observations at step 3 is not finite"):
         DemoStore(tmp_path).save(ID, "reach", attempts, failed=0, settings={})
@@ -214,7 +214,7 @@ def test_a_data_set_lies_inside_the_root(tmp_path: Path, dataset_id: str):
     assert list(root.iterdir()) == [root / "link"]
 
 
-def test_whoever_is_slower_takes_what_the_faster_one_wrote(attempts: list[Attempt], tmp_path: Path, monkeypatch):
+def test_whoever_is_slower_takes_what_the_faster_one_wrote(attempts: list[Episode], tmp_path: Path, monkeypatch):
     writers = threading.Barrier(2)
     replace = Path.replace
 

@@ -17,6 +17,7 @@ from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import WorkError
 from dmil_core.methods.dmil.method import Dmil
 from dmil_core.methods.registry import OURS
+from dmil_core.trajectories import Episode
 from services import meta_train, reproduce
 from services.cli.arguments import exit_code
 from services.demonstrations.store import DemoStore, TaskDemonstrations
@@ -28,7 +29,6 @@ from services.distributed.simulation_worker import SimulationWorker
 from services.experiments.experiment import Experiment, open_runner
 from services.experiments.meta_training import CollapseWatch
 from services.storage.checkpoints import Checkpoints
-from services.suites.base import Attempt
 from tests.services.distributed.courses import ITERATIONS, alone, assert_same_bits, follow, pid_of, plan_of, training
 
 SLOTS = 5
@@ -268,7 +268,7 @@ def test_a_failing_expert_and_a_failing_trial_are_named(
     train("run", "--training.iterations", "1")
     capsys.readouterr()
     with monkeypatch.context() as patch:
-        patch.setattr("services.distributed.work_items.try_out", lambda *given: 1 / 0)
+        patch.setattr("services.distributed.work_items.evaluate_adaptation", lambda *given: 1 / 0)
         assert exit_code(meta_train.run, ["--resume", "run", "--runner", "local"]) == 1
         said = capsys.readouterr().err
         assert "meta-training task reach, 1-shot, support set 0, seed 0: ZeroDivisionError: division by zero" in said
@@ -308,7 +308,7 @@ def nonfinite(data: dict[str, TaskDemonstrations], workplace: Path, monkeypatch:
             if task == "push" and index == 3:
                 actions[:] = 1e30
             observations = np.concatenate([demonstration.observations, demonstration.observations[-1:]])
-            attempts.append(Attempt(index, [0.0], len(actions) - 1, observations, actions))
+            attempts.append(Episode(observations, actions, index, [0.0], len(actions) - 1))
         store.save(dataset.id, task, attempts, failed=0, settings={})
     monkeypatch.setenv("DMIL_DATA", str(store.root))
     return store

@@ -16,10 +16,10 @@ from safetensors.numpy import save
 from dmil_core.configs import PRESETS
 from dmil_core.demonstrations import digest
 from dmil_core.outer_loop import OuterState
+from dmil_core.trajectories import Episode
 from services.demonstrations.store import DemoStore
 from services.storage.checkpoints import Checkpoint, Checkpoints, Manifest
 from services.storage.checksums import sha256, write_listing
-from services.suites.base import Attempt
 
 
 class CheckpointReader:
@@ -123,7 +123,7 @@ class DatasetReader:
         self.store, self.path, self.named = DemoStore(folder), folder / self.ID, self.ID
         generator = np.random.default_rng(0)
         attempts = [
-            Attempt(
+            Episode(
                 seed=length, goal=[0.5], solved_at=0,
                 observations=generator.normal(size=(length + 1, 5)).astype(np.float32),
                 actions=generator.normal(size=(length, 2)).astype(np.float32),

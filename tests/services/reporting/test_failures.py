@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dmil_core.trajectories import Rollout
 from services import report
 from services.cli.colours import COLOURS
 from services.distributed.runner import LocalRunner
 from services.evaluation.results import EpisodeResult, write_rows
 from services.experiments.finished_run import FinishedRun
-from services.experiments.replay import Seen
+from services.experiments.replay import ReplayedEpisode
 from services.reporting.drawing import Picture
 from services.reporting.failures import FAILED, SOLVED, draw_episodes, failures_of_run, worst_tasks
 from services.reporting.page import Commands, DataTable, Prose, Section
-from services.rollouts.episodes import Episode
-from services.rollouts.recording import Footage, Watched
+from services.rollouts.recording import Recording
 from services.suites.base import Measure
 from services.suites.rendering import RenderingError
 from tests.services.reporting.made_runs import TASKS, make_run
@@ -43,12 +43,21 @@ def prose(section: Section) -> list[str]:
     return [part.text for part in section.parts if isinstance(part, Prose)]
 
 
-def seen_with(courses: list[np.ndarray], solved: list[bool], row: EpisodeResult, name: str) -> list[Seen]:
+def replayed_with(
+    courses: list[np.ndarray], solved: list[bool], row: EpisodeResult, name: str
+) -> list[ReplayedEpisode]:
     """Return episodes that might have been seen, with the measure at each step."""
     found = []
     for course, success in zip(courses, solved, strict=True):
-        episode = Episode(0, [], success, int(success), [0] * len(course))
-        found.append(Seen(row, Watched(episode, Footage(np.zeros((len(course), 4), np.float32), {name: course}, []))))
+        steps = len(course)
+        rollout = Rollout(
+            np.zeros((steps + 1, 39), np.float32),
+            np.zeros((steps, 4), np.float32),
+            solved_at=steps - 1 if success else None,
+            score=int(success),
+            sub_skills=np.zeros(steps, np.int64),
+        )
+        found.append(ReplayedEpisode(row, rollout, Recording({name: course}, [])))
     return found
 
 
@@ -101,7 +110,7 @@ def test_it_draws_what_the_episodes_were(with_rows):
 
 def test_failures_are_told_apart_by_colour_dash_and_mark(finished: FinishedRun):
     courses = [np.linspace(0.3, end, 20) for end in (0.2, 0.1, 0.0)]
-    seen = seen_with(courses, [False, False, True], finished.episodes[0], "d")
+    seen = replayed_with(courses, [False, False, True], finished.episodes[0], "d")
     picture = draw_episodes(seen, Measure("d", "distance (m)"), 1)
     assert set(re.findall(r"#[0-9a-f]{6}", picture.svg)) & set(COLOURS) == {FAILED["color"], SOLVED["color"]}
     assert FAILED["linestyle"] != SOLVED["linestyle"]
@@ -115,7 +124,7 @@ def test_failures_are_told_apart_by_colour_dash_and_mark(finished: FinishedRun):
 def test_equal_scores_are_drawn_apart(finished: FinishedRun):
     course = np.repeat([0.0, 1.0, 2.0], 10)
     measure = Measure("score", "sub-tasks done")
-    picture = draw_episodes(seen_with([course, course], [False, False], finished.episodes[0], "score"), measure, 4)
+    picture = draw_episodes(replayed_with([course, course], [False, False], finished.episodes[0], "score"), measure, 4)
     assert "equal scores are drawn a little apart" in picture.description
     assert "None solved." in picture.description
     assert all(f">{score}<" in picture.svg for score in range(5)), "the scores that there may be"

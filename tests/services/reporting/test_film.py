@@ -9,7 +9,17 @@ from matplotlib.colors import to_rgb
 from PIL import Image, ImageSequence
 
 from services.cli.colours import colour_of
-from services.reporting.film import BORDER, FAILED, FORMS, HELD_SECONDS, SOLVED, Side, compose, film_of, write_film
+from services.reporting.film import (
+    BORDER,
+    FAILED,
+    FORMS,
+    HELD_SECONDS,
+    SOLVED,
+    Side,
+    compose,
+    video_settings,
+    write_film,
+)
 from services.rollouts.recording import Frame
 
 HEIGHT, WIDTH = 60, 200
@@ -81,8 +91,8 @@ def test_sides_stand_beside_each_other_and_the_shorter_one_waits():
 
 def test_long_episodes_are_sped_up_and_short_ones_are_not():
     for form in FORMS.values():
-        assert film_of("corner2", 20, form).every == 1
-        every = film_of("corner2", 500, form).every
+        assert video_settings("corner2", 20, form).every == 1
+        every = video_settings("corner2", 500, form).every
         assert every > 1
         assert 500 / every / form.rate <= 7.5
 

@@ -8,8 +8,8 @@ import pytest
 from dmil_core.configs import DemonstrationConfig, EvaluationConfig, SuiteConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import Decision, Flat, SubSkillUse
-from services.rollouts.adaptations import imitation_error, plan_adaptations
-from services.rollouts.episodes import demonstrate, record, rollout
+from services.rollouts.adaptations import EpisodeOutcome, imitation_error, plan_adaptations
+from services.rollouts.episodes import collect_rollouts, demonstrate, rollout
 from services.suites.base import Environment, Expert
 from services.suites.metaworld import MetaWorldSuite
 
@@ -117,10 +117,12 @@ def test_episodes_in_lockstep_are_the_single_ones(suite, make_envs, task: str):
     envs, seeds = make_envs(task, 4), [11, 12, 13, 14]
     together = ExpertPolicy(suite.expert(task))
     episodes = rollout(together, envs, seeds, HORIZON)
-    assert len({episode.steps for episode in episodes}) > 1, "the episodes end together: the test shows nothing"
+    assert len({len(episode) for episode in episodes}) > 1, "the episodes end together: the test shows nothing"
     for number, (seed, env) in enumerate(zip(seeds, reversed(envs), strict=True)):
         alone = ExpertPolicy(suite.expert(task))
-        assert rollout(alone, [env], [seed], HORIZON) == [episodes[number]]
+        (single,) = rollout(alone, [env], [seed], HORIZON)
+        assert EpisodeOutcome.of(single) == EpisodeOutcome.of(episodes[number])
+        assert np.array_equal(single.actions, episodes[number].actions)
         assert np.array_equal(alone.episode(0), together.episode(number))
 
 
@@ -129,9 +131,9 @@ def test_an_episode_ends_at_its_first_success(suite, make_envs):
     policy = ExpertPolicy(suite.expert("reach"))
     (episode,) = rollout(policy, [env], [11], HORIZON)
     assert episode.success
-    assert sum(episode.sub_skill_steps) == episode.steps == len(policy.episode(0)) < HORIZON
-    (cut_short,) = rollout(policy, [env], [11], episode.steps - 1)
-    assert (cut_short.success, cut_short.steps) == (False, episode.steps - 1)
+    assert sum(EpisodeOutcome.of(episode).sub_skill_steps) == len(episode) == len(policy.episode(0)) < HORIZON
+    (cut_short,) = rollout(policy, [env], [11], len(episode) - 1)
+    assert (cut_short.success, len(cut_short)) == (False, len(episode) - 1)
 
 
 def test_a_policy_that_diverged_fails_there_and_then(suite, make_envs):
@@ -144,8 +146,12 @@ def test_a_policy_that_diverged_fails_there_and_then(suite, make_envs):
     envs = make_envs("reach", 3)
     episodes = rollout(Diverging(suite.expert("reach")), envs, [11, 12, 13], HORIZON)
     sound = rollout(ExpertPolicy(suite.expert("reach")), envs, [11, 12, 13], HORIZON)
-    assert (episodes[1].success, episodes[1].steps, episodes[1].goal) == (False, 4, sound[1].goal)
-    assert episodes[::2] == sound[::2]
+    assert (episodes[1].success, len(episodes[1]), episodes[1].goal) == (False, 4, sound[1].goal)
+    assert [episode.diverged for episode in episodes] == [False, True, False]
+    for episode, of_sound in zip(episodes[::2], sound[::2], strict=True):
+        assert EpisodeOutcome.of(episode) == EpisodeOutcome.of(of_sound)
+    with pytest.raises(FloatingPointError, match="not finite"):
+        collect_rollouts(Diverging(suite.expert("reach")), envs, 11, 3 * HORIZON, HORIZON)
 
 
 def test_an_expert_as_a_policy_solves_its_task(suite, make_envs):
@@ -192,12 +198,12 @@ def test_the_error_is_of_each_step_with_the_memory_of_its_own_episode():
     assert imitation_error(policy, [demonstration(1), demonstration(0, 1, 4)]) == (1 + 0 + 0 + 4) / 4
 
 
-def test_a_recorded_episode_is_the_one_that_is_counted(suite, make_envs):
+def test_a_rollout_holds_what_the_policy_saw_and_is_cut_off_at_the_limit(suite, make_envs):
     envs, seeds = make_envs("reach", 2), [5, 6]
-    counted = rollout(ExpertPolicy(suite.expert("reach")), envs, seeds, HORIZON)
     policy = ExpertPolicy(suite.expert("reach"))
-    recorded = record(policy, envs, seeds, HORIZON, HORIZON)
-    for number, (episode, found) in enumerate(zip(counted, recorded, strict=True)):
-        assert (found.success, len(found.actions)) == (episode.success, episode.steps)
-        assert np.bincount(found.sub_skills).tolist() == episode.sub_skill_steps
-        assert np.array_equal(found.observations[:-1], policy.episode(number))
+    whole, cut_off = (rollout(policy, envs, seeds, HORIZON, limit) for limit in (None, 3))
+    for number, (episode, part) in enumerate(zip(whole, cut_off, strict=True)):
+        assert np.array_equal(episode.observations[:-1], policy.episode(number))
+        assert (episode.ended, part.ended, len(part)) == (True, False, 3)
+        assert np.array_equal(episode.observations[:4], part.observations)
+        assert np.array_equal(episode.sub_skills[:3], part.sub_skills)

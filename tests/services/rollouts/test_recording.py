@@ -1,12 +1,14 @@
-"""Who watches an episode changes nothing in it, and sees every step of it."""
+"""Recording an episode changes nothing in it, and keeps every step of it."""
 
 import numpy as np
 import pytest
 
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
 from dmil_core.methods.base import Decision, Flat
+from dmil_core.trajectories import Rollout
+from services.rollouts.adaptations import EpisodeOutcome
 from services.rollouts.episodes import demonstrate, rollout
-from services.rollouts.recording import Film, Watched, watch, watch_expert
+from services.rollouts.recording import Recording, VideoSettings, record_expert, record_rollouts
 from services.suites.base import build_env, measure_of
 from services.suites.registry import open_suite
 from services.suites.rendering import RenderingError
@@ -23,51 +25,53 @@ class Wandering(Flat):
         return Decision(actions, np.zeros(len(observations), np.int64), memory)
 
 
-def watched(films: dict[int, Film]) -> list[Watched]:
+def recorded(videos: dict[int, VideoSettings]) -> list[tuple[Rollout, Recording]]:
     envs = [build_env(SUITE, "reach", measured=True) for _ in SEEDS]
     try:
-        return watch(Wandering(), envs, SEEDS, HORIZON, films)
+        return record_rollouts(Wandering(), envs, SEEDS, HORIZON, videos)
     except RenderingError as error:
         pytest.skip(str(error))
 
 
-def test_a_watched_episode_is_that_of_an_unwatched_rollout():
+def test_a_recorded_rollout_is_one_that_is_not_recorded():
     plain = rollout(Wandering(), [build_env(SUITE, "reach") for _ in SEEDS], SEEDS, HORIZON)
-    assert [one.episode for one in watched({})] == plain
+    for (one, _), other in zip(recorded({}), plain, strict=True):
+        assert EpisodeOutcome.of(one) == EpisodeOutcome.of(other)
+        assert np.array_equal(one.observations, other.observations)
+        assert np.array_equal(one.actions, other.actions)
 
 
-def test_all_that_was_done_and_told_is_seen_step_by_step():
+def test_a_recording_has_the_numbers_of_every_step():
     measure = measure_of(SUITE, "reach")
     assert measure is not None
-    for seed, one in zip(SEEDS, watched({}), strict=True):
-        footage = one.footage
-        assert footage.actions.shape == (HORIZON, 4)
-        assert np.abs(footage.actions).max() == 1, "as clipped to the action space"
-        assert footage.frames == []
+    for seed, (one, recording) in zip(SEEDS, recorded({}), strict=True):
+        assert one.actions.shape == (HORIZON, 4)
+        assert np.abs(one.actions).max() > 1, "as the policy chose them"
+        assert recording.frames == []
         env = build_env(SUITE, "reach", measured=True)
         env.reset(seed=seed)
-        told = [env.step(action)[-1][measure.name] for action in footage.actions]
-        assert footage.numbers[measure.name].tolist() == told
-        assert all(len(course) == HORIZON for course in footage.numbers.values())
+        wanted = [env.step(np.clip(action, -1, 1))[-1][measure.name] for action in one.actions]
+        assert recording.infos[measure.name].tolist() == wanted
+        assert all(len(course) == HORIZON for course in recording.infos.values())
 
 
-def test_a_film_has_a_picture_at_the_reset_at_every_so_many_steps_and_at_the_end():
-    filmed, unfilmed = watched({0: Film(SUITE.camera, 3, 48, 64)})  # type: ignore[attr-defined]
-    assert [frame.step for frame in filmed.footage.frames] == [0, 3, 6, 7]
-    assert {frame.picture.shape for frame in filmed.footage.frames} == {(48, 64, 3)}
-    assert not np.array_equal(filmed.footage.frames[0].picture, filmed.footage.frames[-1].picture), "the robot moves"
-    assert unfilmed.footage.frames == []
+def test_a_video_has_a_frame_at_the_reset_at_every_so_many_steps_and_at_the_end():
+    (_, filmed), (_, unfilmed) = recorded({0: VideoSettings(SUITE.camera, 3, 48, 64)})  # type: ignore[attr-defined]
+    assert [frame.step for frame in filmed.frames] == [0, 3, 6, 7]
+    assert {frame.picture.shape for frame in filmed.frames} == {(48, 64, 3)}
+    assert not np.array_equal(filmed.frames[0].picture, filmed.frames[-1].picture), "the robot moves"
+    assert unfilmed.frames == []
 
 
-def test_an_expert_that_is_watched_demonstrates_the_same():
+def test_an_expert_that_is_recorded_demonstrates_the_same():
     config, expert = DemonstrationConfig(), SUITE.expert("reach")
     assert expert is not None
     wanted = demonstrate(expert, build_env(SUITE, "reach"), 5, 100, config)
     try:
-        film = Film(SUITE.camera, 50, 48, 64)  # type: ignore[attr-defined]
-        attempt, footage = watch_expert(expert, build_env(SUITE, "reach"), 5, 100, config, film)
+        video = VideoSettings(SUITE.camera, 50, 48, 64)  # type: ignore[attr-defined]
+        attempt, recording = record_expert(expert, build_env(SUITE, "reach"), 5, 100, config, video)
     except RenderingError as error:
         pytest.skip(str(error))
     assert attempt.solved_at == wanted.solved_at is not None
     assert np.array_equal(attempt.observations, wanted.observations)
-    assert len(footage.actions) == len(attempt.actions) == footage.frames[-1].step
+    assert len(attempt) == recording.frames[-1].step

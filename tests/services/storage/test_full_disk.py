@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dmil_core.trajectories import Episode
 from services import meta_train
 from services.cli.arguments import exit_code
 from services.demonstrations.store import DemoStore
 from services.evaluation.results import EpisodeResult, write_rows
 from services.storage.checkpoints import Checkpoints
 from services.storage.files import DiskFullError
-from services.suites.base import Attempt
 from tests.services.conftest import QUICK_EVALUATION
 
 
@@ -65,7 +65,7 @@ def test_no_half_of_a_data_set_or_of_rows_counts(small_disk: Path, data):
     dataset = data["reach"]
     draw = np.random.default_rng(0)
     attempts = [
-        Attempt(index, [0.0], 10, draw.normal(size=(300, 39)).astype(np.float32), np.zeros((299, 4), np.float32))
+        Episode(draw.normal(size=(300, 39)).astype(np.float32), np.zeros((299, 4), np.float32), index, [0.0], 10)
         for index in range(20)
     ]
     with pytest.raises(DiskFullError, match=rf"{small_disk}.*needs \d+ bytes"):

@@ -10,7 +10,7 @@ from torch.distributions import Normal
 
 from dmil_core.configs import BASE_PRESETS, EvaluationConfig, TrainingConfig
 from dmil_core.losses import Steps
-from dmil_core.methods.base import FineTuning, MetaLearner, OnlineMetaLearner, Policy, Rollout
+from dmil_core.methods.base import FineTuning, MetaLearner, OnlineMetaLearner, Policy
 from dmil_core.methods.option_gail.method import (
     OptionBatch,
     OptionGail,
@@ -21,6 +21,7 @@ from dmil_core.methods.option_gail.method import (
 from dmil_core.methods.option_gail.option_model import Chain, posterior, viterbi
 from dmil_core.networks import Parameters, flatten, unflatten
 from dmil_core.seeding import named_rng
+from dmil_core.trajectories import Rollout
 from tests.dmil_core.methods.conftest import OFFLINE, PLAYING, drawn_parameters, model_of
 from tests.dmil_core.methods.toys import STEPS, collect_rollouts, meta_trained, record, recovered, training_sets
 
@@ -203,7 +204,8 @@ def test_adaptation_raises_the_likelihood_of_the_support(offline, demonstrations
 def test_a_round_is_pure_and_reports_what_it_took(playing, demonstrations, rollouts) -> None:
     parameters = drawn_parameters(playing)
     before = flatten(parameters)
-    empty = Rollout(np.zeros((1, 4), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.int64), False, False)
+    nothing = np.zeros((1, 4), np.float32), np.zeros((0, 3), np.float32)
+    empty = Rollout(*nothing, sub_skills=np.zeros(0, np.int64), ended=False)
 
     def of_seed(seed: int) -> OptionBatch:
         batch = replace(playing.sample(demonstrations, 4, named_rng(0, "batch")), seed=seed)
