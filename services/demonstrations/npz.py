@@ -6,11 +6,10 @@ the other, and ``episode_lengths`` (demonstrations); it may hold ``tasks``, name
 
 import io
 import math
-import re
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -35,16 +34,8 @@ END = b"PK\x05\x06"
 """Begins the 22 bytes that end an archive without a comment."""
 END_64 = b"PK\x06\x07"
 """Begins the 20 bytes before, in an archive of over 4 GB or 65535 members."""
-HEADER = re.compile(
-    rb"\{ ?'descr': ?'([<|=]?[fiuU]\d{1,9})', ?'fortran_order': ?(?:False|True), ?"
-    rb"'shape': ?\((\d{1,18}(?:, ?\d{1,18})*),?\),? ?\} *\n"
-)
-"""Of an array as numpy writes it."""
-
-
-class _Header(NamedTuple):
-    dtype: np.dtype
-    shape: tuple[int, ...]
+MOST_HEADER = 2**10
+"""Bytes of an array's header; those that numpy writes for these arrays have 128."""
 
 
 def read_npz(path: Path, task: str, obs_dim: int | None = None) -> list[Demonstration]:
@@ -75,8 +66,11 @@ def read_npz(path: Path, task: str, obs_dim: int | None = None) -> list[Demonstr
             Demonstration(f"{index:03d}", task, observations[start:end], actions[start:end])
             for index, (start, end) in enumerate(zip([0, *ends[:-1]], ends, strict=True))
         ]
-    # What zipfile raises of damaged archives; NotImplementedError and RuntimeError for what it does not read.
-    except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError) as error:
+    # What zipfile and numpy raise of damaged files; NotImplementedError and RuntimeError for what they do not read.
+    except (
+        OSError, ValueError, TypeError, EOFError, SyntaxError, MemoryError, RuntimeError,
+        zipfile.BadZipFile, zlib.error, tokenize.TokenError,
+    ) as error:  # fmt: skip
         known = isinstance(error, DemonstrationError)
         got = str(error) if known else f"got {type(error).__name__}, {error}; wanted an npz file as numpy writes it"
         raise DemonstrationError(f"{path}: {got}") from error
@@ -134,34 +128,26 @@ def _name(member: zipfile.ZipInfo) -> str:
 
 
 def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str) -> np.ndarray:
-    """Return an array, whose header is found to be true before numpy sees it."""
-    with archive.open(member) as file:
-        content = file.read(member.file_size)  # without a number it would unpack more, and only then cut off
-    header = _header(content, name)
-    kinds, axes = FORMS[name]
-    if header.dtype.kind not in kinds or len(header.shape) != axes:
-        raise DemonstrationError(
-            f"{name}: got {header.dtype} of the shape {header.shape}; wanted {axes} axes and a type of the kind "
-            f"{' or '.join(kinds)}"
-        )
-    return np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
-
-
-def _header(content: bytes, name: str) -> _Header:
-    """Read what the first bytes say of an array.
+    """Return an array, whose header is checked before memory is taken for it.
 
     Raises:
-        ValueError: if it is not as numpy writes it, or the array would have another size than there is.
+        ValueError: if the header is not one of numpy's, or the array would have another size than there is.
     """
-    size = int.from_bytes(content[8:10], "little")
-    found = HEADER.fullmatch(content[10 : 10 + size])
-    if content[:8] != b"\x93NUMPY\x01\x00" or found is None:
-        got = shown(content[10:110].decode("latin1"))
-        raise DemonstrationError(f"{name}: got the header {got}; wanted numbers or text in numpy's format 1.0")
-    header = _Header(np.dtype(found[1].decode()), tuple(map(int, found[2].split(b","))))
-    wanted = math.prod(header.shape) * header.dtype.itemsize
-    if (there := len(content) - 10 - size) != wanted:
+    with archive.open(member) as file:
+        content = file.read(member.file_size)  # without a number it would unpack more, and only then cut off
+    stream = io.BytesIO(content)
+    if (version := np.lib.format.read_magic(stream)) != (1, 0):
+        raise DemonstrationError(f"{name}: got numpy's format {version}; wanted numbers or text in its format 1.0")
+    shape, _, dtype = np.lib.format.read_array_header_1_0(stream, max_header_size=MOST_HEADER)
+    kinds, axes = FORMS[name]
+    if not dtype.isnative:
+        raise DemonstrationError(f"{name}: got the byte order of {dtype.str}; wanted this machine's")
+    if dtype.kind not in kinds or len(shape) != axes:
         raise DemonstrationError(
-            f"{name}: got {there} bytes for {header.dtype} of the shape {header.shape}; wanted {wanted}"
+            f"{name}: got {dtype} of the shape {shape}; wanted {axes} axes and a type of the kind {' or '.join(kinds)}"
         )
-    return header
+    wanted = math.prod(shape) * dtype.itemsize
+    if (there := len(content) - stream.tell()) != wanted or min(shape) < 0:
+        raise DemonstrationError(f"{name}: got {there} bytes for {dtype} of the shape {shape}; wanted {wanted}")
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)

@@ -84,8 +84,8 @@ MISTAKES: dict[str, tuple[Callable[[Arrays], object], str]] = {
     "one axis": (changed("actions", np.zeros(9)), "actions: got float64 of the shape (9,)"),
     "three axes": (changed("observations", np.zeros((9, 2, 3))), "observations: got float64 of the shape (9, 2, 3)"),
     "integers": (changed("actions", np.zeros((9, 2), int)), "actions: got int64"),
-    "big-endian": (changed("actions", np.zeros((9, 2), ">f4")), "actions: got the header \"{'descr'"),
-    "complex": (changed("actions", np.zeros((9, 2), complex)), "actions: got the header \"{'descr'"),
+    "big-endian": (changed("actions", np.zeros((9, 2), ">f4")), "actions: got the byte order of >f4"),
+    "complex": (changed("actions", np.zeros((9, 2), complex)), "actions: got complex128"),
     "fewer columns than wanted": (changed("observations", np.zeros((9, 2))), "observations: got 2 columns; wanted"),
     "fewer actions": (changed("actions", np.zeros((8, 2))), "episode_lengths: got [4, 1, 4] for 9 observations and 8"),
     "an empty demonstration": (changed("episode_lengths", [4, 0, 5]), "episode_lengths: got [4, 0, 5]"),
@@ -113,7 +113,7 @@ def test_what_cannot_be_learned_from_is_refused_by_name(write, arrays: Arrays, c
 def test_pickled_objects_are_never_loaded(tmp_path: Path, arrays: Arrays):
     path = tmp_path / "demonstrations.npz"
     np.savez(path, **arrays | {"actions": np.array([[print]], object)})  # type: ignore[arg-type]
-    with pytest.raises(DemonstrationError, match=r"actions: got the header .*'\|O'"):
+    with pytest.raises(DemonstrationError, match=r"actions: got object of the shape"):
         read_npz(path, "kettle")
 
 
