@@ -56,6 +56,7 @@ def test_a_file_overrides_the_preset_and_a_flag_overrides_the_file(yaml_file):
     assert found.method.inner_learning_rate == preset.method.inner_learning_rate
     assert found.training == preset.training
     assert settings(file=file).method.sub_skills == 5
+    assert config_from("ml10-smoke", None, suite="ml45").suite.name == "ml45"
     assert settings() == preset
 
 

@@ -110,6 +110,11 @@ def test_a_demonstration_never_passes_the_horizon(suite, make_envs):
     attempt = demonstrate(suite.expert("pick-place"), env, 5, 9, DemonstrationConfig(noise=0))
     assert attempt.solved_at is None
     assert (len(attempt.actions), len(attempt.observations)) == (9, 10)
+    (env,), config = make_envs("reach", 1), DemonstrationConfig(noise=0, trailing_steps=10)
+    whole = demonstrate(suite.expert("reach"), env, 5, HORIZON, config)
+    assert whole.solved_at is not None
+    cut = demonstrate(suite.expert("reach"), env, 5, whole.solved_at + 4, config)
+    assert (cut.solved_at, len(cut.actions)) == (whole.solved_at, whole.solved_at + 4)
 
 
 @pytest.mark.parametrize("task", ["reach", "push"])

@@ -87,6 +87,15 @@ def test_pairing_decides_what_the_intervals_alone_do_not(tmp_path: Path) -> None
     assert {d.differs for d in tables.differences} == {"yes, higher"}
 
 
+def test_rows_that_win_in_turn_are_not_told_apart(tmp_path: Path) -> None:
+    def solved(variant: str, seed: int, split: str, shots: int, task: str, episode: int) -> float:
+        return float((episode % 2 == 0) == (variant == "DMIL"))
+
+    for difference in tables_of(make(tmp_path, solved)).differences:
+        assert difference.low < 0 < difference.high
+        assert difference.differs == "not decided"
+
+
 def test_what_was_not_run_is_empty_and_not_zero(tmp_path: Path) -> None:
     sweep = make(tmp_path, better, finished=["DMIL"])
     sweep.of_trial("ml10-DMIL-High-seed-1").mkdir(parents=True)

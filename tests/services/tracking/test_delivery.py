@@ -49,6 +49,7 @@ def test_what_mlflow_took_before_a_kill_kept_us_from_noting_it_is_there_once(tmp
 
     delivery = Delivery(tmp_path, mlflow_file)
     delivery.deliver()
+    assert delivery.delivered == len((tmp_path / "tracking.jsonl").read_text().splitlines())
     delivery.close()
     client = MlflowClient(mlflow_file)
     experiment = client.get_experiment_by_name("killed")
