@@ -49,7 +49,6 @@ def test_what_mlflow_took_before_a_kill_kept_us_from_noting_it_is_there_once(tmp
 
     delivery = Delivery(tmp_path, mlflow_file)
     delivery.deliver()
-    assert delivery.delivered == len((tmp_path / "tracking.jsonl").read_text().splitlines())
     delivery.close()
     client = MlflowClient(mlflow_file)
     experiment = client.get_experiment_by_name("killed")
@@ -79,6 +78,20 @@ def test_who_takes_over_begins_where_the_other_ended(tmp_path: Path, mlflow_file
     other.deliver()
     other.close()
     assert (other.run_id, other.delivered) == (one.run_id, 2)
+
+
+@pytest.mark.usefixtures("no_mlflow")
+def test_what_is_delivered_together_is_noted_together(tmp_path: Path, mlflow_file: str):
+    tracker = Tracker(tmp_path, "an experiment")
+    for step in range(1, 4):
+        tracker.metrics(step, {"loss": 1 / step})
+    tracker.close("FINISHED")
+    records = (tmp_path / "tracking.jsonl").read_text().splitlines(keepends=True)
+    (tmp_path / "tracking.jsonl").write_text("".join(records[:-1]))  # without the end: the metrics come last
+    delivery = Delivery(tmp_path, mlflow_file)
+    delivery.deliver()
+    delivery.close()
+    assert (delivery.delivered, delivery.waiting()) == (len(records) - 1, [])
 
 
 @pytest.mark.parametrize("content", ["", "no JSON", "{}", '{"run_id": "x", "delivered": 1}'])
