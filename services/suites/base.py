@@ -77,10 +77,6 @@ class TaskSuite(Protocol):
         ...
 
 
-class SuiteError(UserError):
-    """A package's suite that cannot be used."""
-
-
 def measure_of(suite: TaskSuite, task: str) -> Measure | None:
     """Return what tells how far an episode of a task has come, if the suite names anything."""
     if hasattr(suite, "measure_of"):
@@ -97,7 +93,7 @@ def build_env(suite: TaskSuite, task: str, *, measured: bool = False) -> Environ
         measured: whether the infos of its steps must hold what `measure_of` names.
 
     Raises:
-        SuiteError: if they are not those that the suite names.
+        UserError: if they are not those that the suite names.
     """
     env = getattr(suite, "make_measured_env", suite.make_env)(task) if measured else suite.make_env(task)
     for field, space, size in (
@@ -105,7 +101,7 @@ def build_env(suite: TaskSuite, task: str, *, measured: bool = False) -> Environ
         ("action_space", env.action_space, suite.action_dim),
     ):
         if not isinstance(space, Box) or space.shape != (size,):
-            raise SuiteError(
+            raise UserError(
                 f"{suite.name}: task {task}: {field}: got {space}; wanted a Box of the shape ({size},), as the suite's "
                 f"{'obs_dim' if field == 'observation_space' else 'action_dim'} says; mend either"
             )

@@ -36,10 +36,6 @@ NAMES = {
 """The sub-tasks, in the order in which chains name them, and what gymnasium-robotics calls them."""
 
 
-class UnknownKitchenTaskError(UserError):
-    """A split, a sub-task or a chain that the kitchen does not have."""
-
-
 def chains(without: str, length: int = 4) -> tuple[str, ...]:
     """Return all chains of `length` distinct sub-tasks, in the order of `NAMES`, that lack the one `without`."""
     return tuple("-".join(chain) for chain in combinations([name for name in NAMES if name != without], length))
@@ -155,15 +151,15 @@ class KitchenSuite:
         """Take a split of `SPLITS`, or some other chains in place of its own.
 
         Raises:
-            UnknownKitchenTaskError: for a split or a sub-task that is not there, or a sub-task named twice, or a
+            UserError: for a split or a sub-task that is not there, or a sub-task named twice, or a
                 setting that the kitchen does not have.
         """
         name = DEFAULT_SPLIT if config.name.lower() == "kitchen" else config.name.lower()
         if name not in SPLITS:
-            raise UnknownKitchenTaskError(f"suite.name: got {config.name}; wanted kitchen or {', '.join(SPLITS)}")
+            raise UserError(f"suite.name: got {config.name}; wanted kitchen or {', '.join(SPLITS)}")
         if config.protocol != "paper" or not config.goal_visible:
             field = "goal_visible: got False" if config.protocol == "paper" else f"protocol: got {config.protocol}"
-            raise UnknownKitchenTaskError(f"suite.{field}; that is Meta-World's; leave it out for {name}")
+            raise UserError(f"suite.{field}; that is Meta-World's; leave it out for {name}")
         train, test = SPLITS[name]
         self.name = name if config.train_tasks is config.test_tasks is None else f"{name}-part"
         self.train_tasks = train if config.train_tasks is None else config.train_tasks
@@ -212,13 +208,11 @@ def sub_tasks_of(task: str, field: str = "task") -> tuple[str, ...]:
     """Return the sub-tasks that a chain's name lists.
 
     Raises:
-        UnknownKitchenTaskError: for an unknown one, or one that is named twice.
+        UserError: for an unknown one, or one that is named twice.
     """
     chain = tuple(task.split("-"))
     if not set(chain) <= set(NAMES) or len(set(chain)) < len(chain):
-        raise UnknownKitchenTaskError(
-            f"{field}: got {task}; wanted some of {', '.join(NAMES)}, each at most once, joined by hyphens"
-        )
+        raise UserError(f"{field}: got {task}; wanted some of {', '.join(NAMES)}, each at most once, joined by hyphens")
     return chain
 
 

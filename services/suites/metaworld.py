@@ -62,14 +62,6 @@ WITHOUT_DISTANCE = {"assembly", "box-close", "disassemble", "door-open", "hammer
 warnings.filterwarnings("ignore", message=r"Constant\(s\) may be too high")  # whoever acts clips the actions
 
 
-class UnknownSuiteError(UserError):
-    """A name of a suite that there is not."""
-
-
-class UnknownTaskError(UserError):
-    """A task that Meta-World does not have."""
-
-
 class SeededEpisodes(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
     """Makes ``reset(seed=...)`` mean what gymnasium says, and reports what it drew; Meta-World ignores the seed."""
 
@@ -120,18 +112,17 @@ class MetaWorldSuite:
         """Check the names of suite and tasks.
 
         Raises:
-            UnknownSuiteError: for a suite that there is not, or a setting that it does not have.
-            UnknownTaskError: for a task that there is not.
+            UserError: for a suite or a task that there is not, or a setting that it does not have.
         """
         if config.start_noise != 1:
-            raise UnknownSuiteError(
+            raise UserError(
                 f"suite.start_noise: got {config.start_noise:g}; that is the kitchen's; leave it out for {config.name}"
             )
         name = {name.lower(): name for name in SPLITS}.get(config.name.lower())
         if name is None:
             known = ", ".join(name for name in SPLITS if not name.startswith("ML1-"))
             tasks = ", ".join(task for task in TASKS if f"ML1-{task}" in SPLITS)
-            raise UnknownSuiteError(
+            raise UserError(
                 f"suite.name: got {config.name}; wanted {known}, kitchen-topburner, -microwave, -kettle or -slide, or "
                 f"ML1- and one of {tasks}"
             )
@@ -141,7 +132,7 @@ class MetaWorldSuite:
         self.test_tasks = test if config.test_tasks is None else config.test_tasks
         for field, tasks in (("train_tasks", self.train_tasks), ("test_tasks", self.test_tasks)):
             if unknown := [task for task in tasks if task not in TASKS]:
-                raise UnknownTaskError(f"suite.{field}: got {', '.join(unknown)}; wanted some of {', '.join(TASKS)}")
+                raise UserError(f"suite.{field}: got {', '.join(unknown)}; wanted some of {', '.join(TASKS)}")
         self.horizon = config.horizon or HORIZONS[config.protocol]
         self._goal_visible = config.goal_visible
         rule = f"goal {'visible' if config.goal_visible else 'hidden'}; success at any step within {self.horizon}"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from dmil_core.configs import SuiteConfig
 from dmil_core.errors import UserError
-from services.suites.base import SuiteError, TaskSuite
+from services.suites.base import TaskSuite
 
 ENTRY_POINTS = "dmil.suites"
 """The group of entry points in which a package registers what makes a suite from a `SuiteConfig`."""
@@ -31,8 +31,8 @@ def open_suite(config: SuiteConfig) -> TaskSuite:
     """Make the suite that the settings name.
 
     Raises:
-        UserError: for a name, a task or a setting that the suite does not have.
-        SuiteError: if a package's suite cannot be imported, lacks something or ignores a setting.
+        UserError: for a name, a task or a setting that the suite does not have, or if a package's suite cannot be
+            imported, lacks something or ignores a setting.
     """
     registered = _registered()
     if config.name in registered:
@@ -51,12 +51,12 @@ def _registered() -> dict[str, EntryPoint]:
     """Return the suites of installed packages by name.
 
     Raises:
-        SuiteError: if two packages register one name.
+        UserError: if two packages register one name.
     """
     found: dict[str, EntryPoint] = {}
     for point in entry_points(group=ENTRY_POINTS):
         if (other := found.setdefault(point.name, point)).value != point.value:
-            raise SuiteError(
+            raise UserError(
                 f"entry points {ENTRY_POINTS}: got {point.name} twice, {other.value} and {point.value}; wanted one "
                 "package for each name; uninstall either"
             )
@@ -68,7 +68,7 @@ def _plugged_in(point: EntryPoint, config: SuiteConfig) -> TaskSuite:
     try:
         make: Callable[[SuiteConfig], TaskSuite] = point.load()
     except Exception as error:  # importing a package runs its code, which may raise anything
-        raise SuiteError(
+        raise UserError(
             f"{where}, which cannot be imported: {_told(error)}; wanted what the entry point names; mend its package, "
             "or install it again"
         ) from error
@@ -84,7 +84,7 @@ def _made(make: Callable[[SuiteConfig], TaskSuite], config: SuiteConfig, where: 
     except UserError:
         raise
     except Exception as error:
-        raise SuiteError(
+        raise UserError(
             f"{where}: got {_told(error)}; wanted a suite for {config!r}, or a UserError that says what it cannot do"
         ) from error
 
@@ -93,20 +93,20 @@ def _check_attributes(suite: TaskSuite, where: str) -> None:
     """Compare what a package made with `TaskSuite`.
 
     Raises:
-        SuiteError: names what is missing, or of another kind.
+        UserError: names what is missing, or of another kind.
     """
     for attribute, kind in ATTRIBUTES.items():
         found = getattr(suite, attribute, None)
         if not isinstance(found, kind) or not found or (isinstance(found, int) and found < 1):
             wanted = "an integer of at least 1" if kind is int else f"{kind.__name__}, not empty"
-            raise SuiteError(f"{where}: {attribute}: got {found!r}; wanted {wanted}; see {GUIDE}")
+            raise UserError(f"{where}: {attribute}: got {found!r}; wanted {wanted}; see {GUIDE}")
     for method in METHODS:
         if not callable(found := getattr(suite, method, None)):
-            raise SuiteError(f"{where}: {method}: got {found!r}; wanted a method; see {GUIDE}")
+            raise UserError(f"{where}: {method}: got {found!r}; wanted a method; see {GUIDE}")
     named = [("family", suite.family), *(("tasks", task) for task in (*suite.train_tasks, *suite.test_tasks))]
     for attribute, name in named:
         if not isinstance(name, str) or not NAME.fullmatch(name):
-            raise SuiteError(
+            raise UserError(
                 f"{where}: {attribute}: got {name!r}; wanted letters, digits, dots and hyphens: data sets "
                 "are named by it"
             )
@@ -118,18 +118,18 @@ def _check_settings(
     """Compare a suite with what the settings ask for.
 
     Raises:
-        SuiteError: if it ignores a setting, which would then be recorded as though it were in force.
+        UserError: if it ignores a setting, which would then be recorded as though it were in force.
     """
     for field in ("train_tasks", "test_tasks", "horizon"):
         if (wanted := getattr(config, field)) is not None and (got := getattr(suite, field)) != wanted:
-            raise SuiteError(f"{where}: {field}: got {got!r}; wanted the {wanted!r} of the settings; see {GUIDE}")
+            raise UserError(f"{where}: {field}: got {got!r}; wanted the {wanted!r} of the settings; see {GUIDE}")
     for field in IN_PROTOCOL:
         usual = SuiteConfig.model_fields[field].default
         if (given := getattr(config, field)) == usual:
             continue
         other = _made(make, config.model_copy(update={field: usual}), where)
         if other.protocol == suite.protocol and (field != "horizon" or other.horizon != suite.horizon):
-            raise SuiteError(
+            raise UserError(
                 f"suite.{field}: got {given!r}; without it {suite.name} has the same protocol, {suite.protocol!r}; "
                 "leave it out, or, if the suite heeds it, name it in its protocol"
             )
