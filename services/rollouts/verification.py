@@ -38,7 +38,10 @@ def verify(suite: TaskSuite, task: str, seeds: Sequence[int], noise: float) -> l
     env, config = build_env(suite, task), DemonstrationConfig(noise=noise, trailing_steps=0)
     rows, first = [], None
     for seed in seeds:
-        attempt = demonstrate(expert, env, seed, suite.horizon, config)
+        try:
+            attempt = demonstrate(expert, env, seed, suite.horizon, config)
+        except UserError as error:
+            raise UserError(f"{suite.name}: {error}") from error
         first = first or attempt
         rows.append(VerificationRow(task, seed, noise, attempt.success, attempt.score, len(attempt)))
     if first is not None:
