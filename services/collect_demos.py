@@ -21,7 +21,8 @@ from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import DEFAULT_PRESET, EARLY, defaults_from
 from services.cli.progress import Clock, console
 from services.demonstrations.store import TaskDemonstrations, open_store
-from services.experiments.experiment import Experiment, RunnerKind, open_runner
+from services.distributed.ray_runner import RunnerKind, open_runner
+from services.experiments.experiment import Experiment
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,10 @@ from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import with_evaluation
 from services.cli.progress import Clock, console
 from services.demonstrations.store import open_store
+from services.distributed.ray_runner import RunnerKind, open_runner
 from services.evaluation.summary import summarise
 from services.experiments.champions import ALIAS, open_contest
-from services.experiments.experiment import Experiment, RunnerKind, open_runner
+from services.experiments.experiment import Experiment
 from services.reporting.end_of_run import show, write_report
 from services.storage.checkpoints import Checkpoint, Checkpoints
 

@@ -20,8 +20,9 @@ from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import DEFAULT_PRESET, EARLY, defaults_from
 from services.cli.progress import Clock, console
 from services.demonstrations.store import open_store
+from services.distributed.ray_runner import RunnerKind, open_runner
 from services.evaluation.summary import summarise
-from services.experiments.experiment import Experiment, OnNonfinite, RunnerKind, open_runner
+from services.experiments.experiment import Experiment, OnNonfinite
 from services.experiments.finished_run import FinishedRun
 from services.reporting.end_of_run import PAGE, publish, show, write_report
 from services.storage.checkpoints import Checkpoint, Checkpoints

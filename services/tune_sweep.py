@@ -20,7 +20,7 @@ from services.cli.progress import Clock, console
 from services.cli.yaml_files import read_yaml
 from services.demonstrations.store import open_store
 from services.distributed.cluster import joined
-from services.distributed.ray_runner import RayRunner
+from services.distributed.ray_runner import open_runner
 from services.experiments.experiment import Experiment
 from services.storage.provenance import git_commit, library_versions
 from services.storage.run_folders import find_folder, new_folder
@@ -180,11 +180,8 @@ def _collect(sweep: SweepFolder) -> None:
     configs = {(trial.config.suite, trial.config.demonstrations): trial.config for trial in sweep.trials.values()}
     for config in configs.values():
         experiment = Experiment(config, store)
-        runner = RayRunner(experiment.suite, None)
-        try:
+        with open_runner("ray", experiment.suite, None) as runner:
             experiment.collect(runner)
-        finally:
-            runner.close()
 
 
 if __name__ == "__main__":

@@ -12,8 +12,8 @@ from dmil_core.statistics import interval_text, success_rate
 from services.cli.arguments import Quiet, exit_code, parse
 from services.cli.composition import suite_settings
 from services.cli.progress import Bar, console
+from services.distributed.ray_runner import RunnerKind, open_runner
 from services.distributed.work_items import Verification
-from services.experiments.experiment import RunnerKind, open_runner
 from services.rollouts.verification import VerificationRow
 from services.suites.base import TaskSuite
 from services.suites.registry import open_suite

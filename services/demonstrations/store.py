@@ -6,6 +6,7 @@
 import errno
 import hashlib
 import json
+import logging
 import os
 import shutil
 import tempfile
@@ -27,11 +28,12 @@ from dmil_core.configs import DemonstrationConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError, digest
 from dmil_core.errors import explain
 from dmil_core.trajectories import Episode
-from services.cli.progress import console
 from services.storage.checksums import check_listing, write_listing
 from services.storage.files import inside, read_file, room_for, sync
 from services.storage.remote import Storage, given_storage
 from services.suites.base import TaskSuite
+
+logger = logging.getLogger(__name__)
 
 LIBRARIES = ("gymnasium", "gymnasium-robotics", "metaworld", "minari", "mujoco", "numpy")
 DIGESTS, ARRAYS, METADATA = "SHA256SUMS", "data/main_data.hdf5", "data/metadata.json"
@@ -190,7 +192,7 @@ class DemoStore:
         try:
             return self._storage.get_folder(f"data/{dataset_id}", self.root / dataset_id, FILES, DIGESTS)
         except Exception as error:  # noqa: BLE001  whatever a storage raises, demonstrations can be made again
-            console.print(f"warning: {self._storage.url} gives no {dataset_id}: {error}", markup=False)
+            logger.warning(f"{self._storage.url} gives no {dataset_id}: {error}")
             return False
 
     def _copy(self, dataset_id: str) -> None:
@@ -201,7 +203,7 @@ class DemoStore:
         try:
             self._storage.put_folder(f"data/{dataset_id}", contents, DIGESTS)
         except Exception as error:  # noqa: BLE001  whatever a storage raises, they are here
-            console.print(f"warning: {self._storage.url} does not take {dataset_id}: {error}", markup=False)
+            logger.warning(f"{self._storage.url} does not take {dataset_id}: {error}")
 
 
 def open_store() -> DemoStore:

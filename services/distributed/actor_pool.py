@@ -10,8 +10,7 @@ import ray
 from ray.exceptions import ObjectLostError, RayActorError, RayError, RayTaskError
 
 from dmil_core.errors import RunError, UserError
-from services.distributed.calls import Call, PoolListener, Worker, referenced
-from services.distributed.errors import DeadlyCallError, LostError
+from services.distributed.calls import Call, DeadlyCallError, LostError, PoolListener, Worker, referenced
 from services.distributed.stragglers import TIMEOUT_FACTOR, Timeouts
 
 PLACEMENT_TIMEOUT_SECONDS = 120

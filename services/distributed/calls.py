@@ -1,8 +1,10 @@
-"""Calls of actors' methods, the workers of a pool that execute them, and the listener of a pool: all without Ray."""
+"""Calls of actors' methods, the workers that execute them, the listener of a pool, and what goes wrong: without Ray."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+
+from dmil_core.errors import RunError
 
 if TYPE_CHECKING:
     from ray import ObjectRef
@@ -90,3 +92,16 @@ class PoolListener:
 
     def call_resent(self, call: Call) -> None:
         """A call that was sent to a worker is sent to another."""
+
+
+class DeadlyCallError(RunError):
+    """A call during which one worker after the other died; `Pool.retry` sends it again."""
+
+    def __init__(self, call: Call) -> None:
+        """Name the call."""
+        super().__init__(f"{call.label}: {call.deaths} workers ended in the course of it, one after the other")
+        self.call = call
+
+
+class LostError(RunError):
+    """An actor outside the pool is gone, or a result that a call depends on: both can be made again."""

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 from dmil_core.errors import WorkError
 from dmil_core.outer_loop import OuterState, blocks, groups, slot_label
 from services.distributed.adaptation_worker import AdaptationWorker, Block, BlockReport
-from services.distributed.calls import Call
-from services.distributed.errors import DeadlyCallError, LostError
+from services.distributed.calls import Call, DeadlyCallError, LostError
 from services.distributed.learner import Learner, StepReport
 from services.distributed.metrics import Meter, WorkerCounter
 from services.distributed.runner import Iteration, Plan

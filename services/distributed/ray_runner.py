@@ -1,20 +1,19 @@
-"""The runner whose workers are Ray actors."""
+"""The runner whose workers are Ray actors, and the choice between it and the one in this process."""
 
 import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
-from dmil_core.errors import WorkError
+from dmil_core.errors import UserError, WorkError
 from services.cli.live_view import Workers
-from services.distributed.calls import Call
+from services.distributed.calls import Call, DeadlyCallError
 from services.distributed.cluster import cpus, joined
-from services.distributed.errors import DeadlyCallError
 from services.distributed.metrics import Meter, RayMeter, WorkerCounter
 from services.distributed.ray_meta_training import RayMetaTraining
-from services.distributed.runner import Plan
+from services.distributed.runner import LocalRunner, Plan, Runner
 from services.distributed.simulation_worker import SimulationWorker, WorkItem
 from services.suites.base import TaskSuite
 
@@ -26,6 +25,23 @@ NICENESS = 10
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
+RunnerKind = Literal["ray", "local"]
+
+
+@contextmanager
+def open_runner(kind: RunnerKind, suite: TaskSuite, workers: int | None) -> Iterator[Runner]:
+    """Open a runner and close it in the end, whatever happens.
+
+    Raises:
+        UserError: if there is nobody to work.
+    """
+    if workers is not None and workers < 1:
+        raise UserError(f"--workers: got {workers}; wanted at least 1; leave it out for one for each CPU")
+    runner: Runner = LocalRunner(suite) if kind == "local" else RayRunner(suite, workers)
+    try:
+        yield runner
+    finally:
+        runner.close()
 
 
 class RayRunner:

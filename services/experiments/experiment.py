@@ -1,7 +1,6 @@
 """One experiment, put together from its config once, for all programs: collect, meta-train, evaluate."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,8 +17,7 @@ from services.cli.progress import Bar
 from services.demonstrations.collection import DemonstrationCollection
 from services.demonstrations.store import DemoStore, TaskDemonstrations
 from services.distributed.failures import keeping_failures
-from services.distributed.ray_runner import RayRunner
-from services.distributed.runner import LocalRunner, Plan, Runner
+from services.distributed.runner import Plan, Runner
 from services.distributed.work_items import AdaptationRollouts
 from services.evaluation.evaluator import Evaluations, Evaluator, Tallies, write_evaluation
 from services.evaluation.summary import Evaluation
@@ -31,24 +29,7 @@ from services.suites.base import Split, TaskSuite
 from services.suites.registry import open_suite
 from services.tracking.tracker import Tracker
 
-RunnerKind = Literal["ray", "local"]
 OnNonfinite = Literal["stop", "skip"]
-
-
-@contextmanager
-def open_runner(kind: RunnerKind, suite: TaskSuite, workers: int | None) -> Iterator[Runner]:
-    """Open a runner and close it in the end, whatever happens.
-
-    Raises:
-        UserError: if there is nobody to work.
-    """
-    if workers is not None and workers < 1:
-        raise UserError(f"--workers: got {workers}; wanted at least 1; leave it out for one for each CPU")
-    runner: Runner = LocalRunner(suite) if kind == "local" else RayRunner(suite, workers)
-    try:
-        yield runner
-    finally:
-        runner.close()
 
 
 class Experiment:

@@ -12,7 +12,7 @@ import tyro
 from dmil_core.errors import UserError
 from services.cli.arguments import parse
 from services.cli.progress import Bar, console
-from services.experiments.experiment import RunnerKind, open_runner
+from services.distributed.ray_runner import RunnerKind, open_runner
 from services.experiments.finished_run import FinishedRun
 from services.reporting.adaptation_curves import adaptation_section, measure
 from services.reporting.curves import training_curves

@@ -24,7 +24,8 @@ from services import meta_train
 from services.cli.arguments import exit_code
 from services.cli.progress import console_logging
 from services.demonstrations.store import DemoStore, TaskDemonstrations
-from services.experiments.experiment import Experiment, open_runner
+from services.distributed.ray_runner import open_runner
+from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoint, Checkpoints
 
 PROJECT = Path(__file__).parents[2]

@@ -16,7 +16,8 @@ from dmil_core.configs import DemonstrationConfig, ExperimentConfig, SuiteConfig
 from dmil_core.demonstrations import DemonstrationError
 from dmil_core.trajectories import Episode
 from services.demonstrations.store import DemoStore, TaskDemonstrations
-from services.experiments.experiment import Experiment, open_runner
+from services.distributed.ray_runner import open_runner
+from services.experiments.experiment import Experiment
 from services.storage.checksums import write_listing
 from services.suites.metaworld import MetaWorldSuite
 from services.suites.registry import open_suite

@@ -11,8 +11,9 @@ from dmil_core.configs import ExperimentConfig
 from dmil_core.methods.base import MetaLearner
 from dmil_core.networks import flatten
 from dmil_core.outer_loop import OuterState
+from services.distributed.ray_runner import open_runner
 from services.distributed.runner import MetaTraining, Plan
-from services.experiments.experiment import Experiment, open_runner
+from services.experiments.experiment import Experiment
 
 ITERATIONS = 4
 

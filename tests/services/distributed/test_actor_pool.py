@@ -13,8 +13,7 @@ import ray
 
 from dmil_core.errors import RunError
 from services.distributed.actor_pool import MAX_DEATHS, Pool
-from services.distributed.calls import Worker
-from services.distributed.errors import DeadlyCallError, LostError
+from services.distributed.calls import DeadlyCallError, LostError, Worker
 from services.distributed.metrics import Meter, WorkerCounter
 
 

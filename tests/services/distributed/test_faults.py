@@ -23,10 +23,10 @@ from services.cli.arguments import exit_code
 from services.demonstrations.store import DemoStore, TaskDemonstrations
 from services.distributed.failures import read_failure
 from services.distributed.ray_meta_training import RayMetaTraining
-from services.distributed.ray_runner import RayRunner
+from services.distributed.ray_runner import RayRunner, open_runner
 from services.distributed.runner import LocalRunner
 from services.distributed.simulation_worker import SimulationWorker
-from services.experiments.experiment import Experiment, open_runner
+from services.experiments.experiment import Experiment
 from services.experiments.meta_training import CollapseWatch
 from services.storage.checkpoints import Checkpoints
 from tests.services.distributed.courses import ITERATIONS, alone, assert_same_bits, follow, pid_of, plan_of, training

@@ -14,10 +14,11 @@ from services.distributed.adaptation_worker import AdaptationWorker
 from services.distributed.chunking import CHUNK_LENGTH, from_chunks, to_chunks
 from services.distributed.learner import Learner
 from services.distributed.ray_meta_training import RayMetaTraining
+from services.distributed.ray_runner import open_runner
 from services.distributed.runner import Runner
 from services.distributed.timing import Span, Timing
 from services.evaluation.results import EpisodeResult
-from services.experiments.experiment import Experiment, open_runner
+from services.experiments.experiment import Experiment
 from tests.services.distributed.courses import ITERATIONS, Course, alone, assert_same_bits, follow, plan_of, training
 
 

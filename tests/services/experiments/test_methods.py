@@ -29,8 +29,9 @@ from dmil_core.seeding import named_rng
 from services import meta_train
 from services.demonstrations.store import DemoStore
 from services.distributed.ray_meta_training import RayMetaTraining
+from services.distributed.ray_runner import open_runner
 from services.distributed.simulation_worker import SimulationWorker
-from services.experiments.experiment import Experiment, open_runner
+from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoints
 from tests.services.conftest import QUICK_EVALUATION
 from tests.services.distributed.courses import alone, assert_same_bits, follow, pid_of, plan_of

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from dmil_core.errors import UserError
+from services.distributed.ray_runner import open_runner
 from services.distributed.runner import LocalRunner
 from services.evaluation.results import EpisodeResult, ImitationResult, read_rows
-from services.experiments.experiment import open_runner
 from services.experiments.finished_run import FinishedRun
 from services.reporting.adaptation_curves import adaptation_section, measure, points
 from services.reporting.lineup import policy_after

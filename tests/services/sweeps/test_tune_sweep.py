@@ -16,7 +16,8 @@ from mlflow.entities import Run
 from dmil_core.configs import ExperimentConfig
 from services import tune_sweep
 from services.demonstrations.store import TaskDemonstrations, open_store
-from services.experiments.experiment import Experiment, open_runner
+from services.distributed.ray_runner import open_runner
+from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoint, Checkpoints
 from services.storage.remote import STORAGE
 from services.sweeps.folders import SweepFolder
