@@ -34,12 +34,7 @@ PROGRAMS = {
 
 
 def peek(arguments: Sequence[str], **options: Callable[[str], Any]) -> argparse.Namespace:
-    """Return some of the options, which decide the defaults of all others.
-
-    Args:
-        arguments: of the command line.
-        **options: the type of each.
-    """
+    """Return some of the options, each converted by its function, which decide the defaults of all others."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name, kind in options.items():
         parser.add_argument(f"--{name}", type=kind)
@@ -47,13 +42,7 @@ def peek(arguments: Sequence[str], **options: Callable[[str], Any]) -> argparse.
 
 
 def parse(program: type[T], description: str, arguments: Sequence[str], defaults: T) -> T:
-    """Read a program's arguments into its dataclass.
-
-    Args:
-        program: the dataclass.
-        description: the first lines of ``--help``.
-        arguments: of the command line.
-        defaults: the value of every argument that is not given.
+    """Read a program's arguments into its dataclass, over `defaults`; `--help` begins with `description`.
 
     Raises:
         UserError: for a value that a setting does not allow; what is no flag at all ends with exit code 2.

@@ -48,8 +48,7 @@ class _ConsoleHandler(logging.Handler):
 def console_logging(*, quiet: bool) -> Iterator[None]:
     """Print what the modules of ``services`` log to the console, for as long as a program runs.
 
-    Args:
-        quiet: print warnings only, and plain lines in place of the live screen.
+    Where it is quiet, that is warnings only, and plain lines in place of the live screen.
     """
     logger = logging.getLogger("services")
     handlers, level, plain = logger.handlers, logger.level, console.plain

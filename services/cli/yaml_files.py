@@ -17,13 +17,7 @@ MOST_CHARACTERS = 500
 
 
 def merged(settings: Mapping[str, Any], given: Mapping[Any, Any], origin: str, prefix: str = "") -> dict[str, Any]:
-    """Return `settings`, by section, with those that are given in their place.
-
-    Args:
-        settings: all that there are.
-        given: some of them.
-        origin: of what is given, for messages.
-        prefix: of the section's name.
+    """Return `settings`, by section, with those that are given in their place; messages begin with `origin`.
 
     Raises:
         UserError: for one that there is not.

@@ -16,10 +16,8 @@ def joined(workers: int | None = None) -> Iterator[None]:
     """Be in a cluster, and leave it in the end.
 
     It is the one joined already, as in a trial of a sweep, which is not left; the one that ``RAY_ADDRESS`` names, as in
-    a Ray job; or one on this machine alone that listens on loopback only.
-
-    Args:
-        workers: CPUs that a cluster of one's own has at least, if there are fewer.
+    a Ray job; or one on this machine alone that listens on loopback only,
+    with at least `workers` CPUs.
     """
     if "RAY_ADDRESS" not in os.environ:
         _secure_local_cluster()

@@ -37,10 +37,7 @@ def keeping_failures(
 ) -> Iterator[None]:
     """Store an error of a work item inside in ``failure.json``, so that the item can be run again.
 
-    Args:
-        folder: of the file.
-        config: of the experiment.
-        checkpoint: stores the state that the failed item starts from, and returns where.
+    `checkpoint` stores the state that the failed item starts from, and returns where.
 
     Raises:
         RunError: names the item, the problem, and the command that runs it again.

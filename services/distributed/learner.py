@@ -24,13 +24,7 @@ class Learner:
     """Holds the parameters and what else its steps depend on."""
 
     def __init__(self, state: OuterState, training: TrainingConfig, *, skip_nonfinite: bool = False) -> None:
-        """Continue from `state`.
-
-        Args:
-            state: the one to continue from.
-            training: settings of the outer loop.
-            skip_nonfinite: count an iteration as done whose step is not taken because its gradient is not finite.
-        """
+        """Continue from `state`; `skip_nonfinite` counts an iteration as done whose gradient is not finite."""
         torch.set_num_threads(1)
         self._skip_nonfinite = skip_nonfinite
         self._step = OuterStep(state, training)

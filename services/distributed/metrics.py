@@ -77,11 +77,7 @@ class RayMeter(Meter):
     """Records in Ray's metrics: a number in memory each, which Ray collects every few seconds."""
 
     def __init__(self, suite: str) -> None:
-        """Start all counters that have no labels of their own.
-
-        Args:
-            suite: label of all metrics of this process.
-        """
+        """Start all counters that have no labels but the suite."""
         self._metrics = {measure: _of_ray(measure, suite) for measure in MEASURES}
         for measure in MEASURES:
             if measure.kind == "counter" and not measure.labels:

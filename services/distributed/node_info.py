@@ -48,13 +48,7 @@ class NodeFacts(NamedTuple):
 
 
 def facts(runs: str, mark: str, cpus: float | None = None) -> NodeFacts:
-    """Return the facts of this machine.
-
-    Args:
-        runs: the folder of runs.
-        mark: the name of a file in it.
-        cpus: by Ray's count.
-    """
+    """Return the facts of this machine, whose `cpus` Ray may count otherwise."""
     there = Path(runs).absolute()
     disk = shutil.disk_usage(next(folder for folder in (there, *there.parents) if folder.exists()))
     cores = len(os.sched_getaffinity(0))
@@ -77,12 +71,7 @@ def facts(runs: str, mark: str, cpus: float | None = None) -> NodeFacts:
 
 
 def cluster_facts(runs: Path, mark: str) -> tuple[list[NodeFacts], list[str]]:
-    """Return the facts of every node of the cluster that this process has joined, and the names of those silent.
-
-    Args:
-        runs: the folder of runs, by the path that all nodes should see it under.
-        mark: the name of a file in it.
-    """
+    """Return the facts of every node of the cluster that this process has joined, and the names of those silent."""
     import ray
     from ray.exceptions import RayError
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy

@@ -44,12 +44,7 @@ def _asking(uri: str) -> Iterator[None]:
 
 
 def open_contest(checkpoint: Checkpoint, experiment: Experiment, folder: Path) -> "Contest":
-    """Find the model of a checkpoint, and the champion that it is to be compared with.
-
-    Args:
-        checkpoint: the challenger's.
-        experiment: of its evaluation.
-        folder: for the champion's checkpoint and rows.
+    """Find the model of a checkpoint, and the champion that it is to be compared with in `folder`.
 
     Raises:
         UserError: if MLflow has no model of the checkpoint, or the champion is of another protocol.
@@ -142,10 +137,6 @@ class Contest:
 
     def settle(self, evaluation: Evaluation, folder: Path) -> list[str]:
         """Register the challenger, move the alias if it is due, and return in words what was decided and why.
-
-        Args:
-            evaluation: of the challenger.
-            folder: of its rows.
 
         Raises:
             RunError: if MLflow does not answer.

@@ -38,10 +38,6 @@ class Experiment:
     def __init__(self, config: ExperimentConfig, store: DemoStore) -> None:
         """Put the experiment together; nothing runs yet.
 
-        Args:
-            config: all settings.
-            store: where its demonstrations are, or will be.
-
         Raises:
             UserError: for a suite, a method, a task or a source of demonstrations that there is not, or iterations of a
                 method without meta-training.
@@ -173,12 +169,7 @@ class Experiment:
     ) -> Evaluation:
         """Adapt a checkpoint to every task of both splits, and return a row for each episode and adaptation.
 
-        Args:
-            runner: does the work.
-            data: every task's demonstrations.
-            checkpoint: what is adapted.
-            folder: the rows are also written to ``episodes.jsonl`` and ``adaptations.jsonl`` in it.
-            only: of all tasks, those to adapt to.
+        They are also written to ``episodes.jsonl`` and ``adaptations.jsonl`` in `folder`; `only` restricts the tasks.
         """
         evaluator = self.evaluator(runner, data, only)
         outcomes: dict[int, AdaptationOutcome] = {}

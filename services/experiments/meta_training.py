@@ -44,16 +44,7 @@ class CheckpointWriter:
         tracker: Tracker,
         needed: Callable[[], Collection[Path]],
     ) -> None:
-        """Write nothing yet.
-
-        Args:
-            checkpoints: of the run.
-            manifest: of the state that meta-training starts from.
-            constants: what the method learned once from the data.
-            runner: its meter receives the time of each checkpoint.
-            tracker: of the run.
-            needed: returns the older checkpoints that must not be removed yet.
-        """
+        """Write nothing yet; `needed` returns the older checkpoints that must not be removed yet."""
         self.folder = checkpoints.folder.parent
         """Of the run."""
         self.manifest = manifest
@@ -115,13 +106,7 @@ class IterationLog:
     """Tracks the metrics of each iteration, and keeps the recent ones for the screen."""
 
     def __init__(self, runner: Runner, tracker: Tracker, evaluations: Evaluations) -> None:
-        """Start without any iterations.
-
-        Args:
-            runner: its meter and its workers.
-            tracker: of the run.
-            evaluations: on the way, the latest of which is shown.
-        """
+        """Start without any iterations."""
         self._runner, self._tracker, self._evaluations = runner, tracker, evaluations
         self._recent: deque[Mapping[str, float]] = deque(maxlen=RECENT)
         self._collapse = CollapseWatch()

@@ -56,10 +56,7 @@ class Replay:
     ) -> list[ReplayedEpisode]:
         """Adapt as for the episode of `row`, and run all episodes of that adaptation, side by side as they were.
 
-        Args:
-            row: of any episode of the adaptation.
-            video: how episodes are filmed.
-            filmed: the numbers of those that are.
+        The episodes with the numbers `filmed` are filmed as `video` says.
 
         Raises:
             ReplayError: if the checkpoint or the demonstrations are not those of the row.

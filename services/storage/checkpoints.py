@@ -215,13 +215,7 @@ class Checkpoints:
         manifest: Manifest,
         needed: Collection[Path] = (),
     ) -> Path:
-        """Write a checkpoint beside, sync it, rename it, and remove those that are no longer kept.
-
-        Args:
-            state: of the learner.
-            constants: what the method learned once from the data.
-            manifest: of this state.
-            needed: older checkpoints that stay too.
+        """Write a checkpoint beside, sync it, rename it, and remove those no longer kept or `needed`.
 
         Raises:
             DiskFullError: for want of space; what was written by then is removed.

@@ -42,10 +42,7 @@ def write_listing(folder: Path, name: str, files: Sequence[str]) -> None:
 def check_listing(folder: Path, name: str, most: dict[str, int]) -> None:
     """Check the files in `folder` whose digests the file `name` in it lists.
 
-    Args:
-        folder: holds the files; nothing outside of it is read.
-        name: of the listing.
-        most: the files that must be listed, with the bytes that each may have.
+    It must list the files of `most`, each of at most so many bytes.
 
     Raises:
         OSError: names the file that is missing, too large, a link out of the folder or not as its digest says.

@@ -21,11 +21,7 @@ class DiskFullError(RunError):
 
 @contextmanager
 def room_for(path: Path, needed: int) -> Iterator[None]:
-    """Write something inside, whose failure for want of space is told in words.
-
-    Args:
-        path: what is written; its folder need not exist yet.
-        needed: bytes.
+    """Write `needed` bytes to `path` inside; its folder need not exist yet.
 
     Raises:
         DiskFullError: if they are not there before, or run out meanwhile.

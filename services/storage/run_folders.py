@@ -9,10 +9,7 @@ from services.storage.files import inside
 def new_folder(name: str, runs: Path, mark: str) -> Path:
     """Return the folder of a new run or sweep; it is not made yet.
 
-    Args:
-        name: of the folder.
-        runs: where it is to lie.
-        mark: the file by which the folder of one that was begun is known.
+    `mark` is the file by which the folder of one that was begun is known.
 
     Raises:
         UserError: if the name is none, or taken.
@@ -26,13 +23,7 @@ def new_folder(name: str, runs: Path, mark: str) -> Path:
 
 
 def find_folder(name: str, runs: Path, mark: str, flag: str = "--resume") -> Path:
-    """Return the folder of a run or sweep that was begun.
-
-    Args:
-        name: its path, or its name in `runs`.
-        runs: where it lies.
-        mark: the file by which it is known.
-        flag: that `name` was given by.
+    """Return the folder of a run or sweep that was begun, by its path or its name in `runs`.
 
     Raises:
         UserError: if there is none.

@@ -90,12 +90,7 @@ class Identity(BaseModel):
 
     @staticmethod
     def found_or_made(folder: Path, experiment: str, parent: str | None = None) -> "Identity":
-        """Read the identity of a run, or give it one.
-
-        Args:
-            folder: of the run.
-            experiment: the MLflow experiment's name.
-            parent: the tag of the run that this one is a trial of.
+        """Read the identity of a run, or give it one, as a trial of the run with the tag `parent`.
 
         Raises:
             UserError: if it is damaged.
@@ -113,11 +108,7 @@ class Delivery:
     """Delivers the records of one run; of all processes, one at a time."""
 
     def __init__(self, folder: Path, uri: str) -> None:
-        """Prepare the delivery; nothing is asked of MLflow yet.
-
-        Args:
-            folder: of a run that has an identity.
-            uri: of MLflow.
+        """Prepare the delivery; nothing is asked of MLflow, which is at `uri`, yet.
 
         Raises:
             UserError: if the identity is missing or damaged, or a record is.

@@ -35,14 +35,7 @@ def checkpoint_in(model: Path) -> Path:
 
 
 def log_model(client: "MlflowClient", run_id: str, checkpoint: Checkpoint, example: dict[str, Any]) -> None:
-    """Have MLflow keep a checkpoint as the model of a run; one that it has already stays as it is.
-
-    Args:
-        client: of MLflow.
-        run_id: of the run.
-        checkpoint: of the run.
-        example: of what the model is asked.
-    """
+    """Have MLflow keep a checkpoint as the model of a run; one that it has already stays as it is."""
     run = client.get_run(run_id)
     if any(model.tags.get(CHECKPOINT_TAG) == checkpoint.digest for model in models_of(client, run)):
         return

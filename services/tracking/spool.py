@@ -89,10 +89,7 @@ class Line(NamedTuple):
 def read_spool(path: Path, *, line: int = 0, offset: int = 0) -> Iterator[Line]:
     """Yield the records of a file that may still grow; a last line without its end is none yet.
 
-    Args:
-        path: the file; one that is not there holds no records.
-        line: how many lines stand before the offset.
-        offset: bytes to leave out.
+    The first `line` lines, of `offset` bytes, are left out; a file that is not there holds no records.
 
     Raises:
         UserError: names the file and the line that is damaged.

@@ -122,12 +122,7 @@ class Tracker:
         self._spool.append("artifact", Artifact(path=str(below), folder=folder))
 
     def model(self, checkpoint: Path, support: Sequence[Demonstration]) -> None:
-        """Record a checkpoint below the run's folder as the run's model.
-
-        Args:
-            checkpoint: its folder.
-            support: demonstrations of one task, whose first steps are what the model shows as its example.
-        """
+        """Record a checkpoint below the run's folder as its model, whose example is the first steps of `support`."""
         below = checkpoint.absolute().relative_to(self._folder.absolute())
         parts = [demonstration.window(0, min(EXAMPLE_STEPS, len(demonstration))) for demonstration in support]
         example = Example.model_validate(packed(parts, parts[0].observations[0]))
