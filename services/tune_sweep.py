@@ -3,6 +3,7 @@
 What is trained once, by this sweep or another, is not trained again.
 """
 
+import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -34,6 +35,16 @@ from services.tracking.system import recording_system
 from services.tracking.tracker import Tracker
 
 CONFIGS = Path(__file__).parents[1] / "tune_configs"
+TUNE_SETTINGS = {
+    "RAY_CHDIR_TO_TRIAL_DIR": "0",
+    "TUNE_DISABLE_SIGINT_HANDLER": "1",
+    "TUNE_WARN_THRESHOLD_S": "10",
+    "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
+    "TUNE_DISABLE_STRICT_METRIC_CHECKING": "1",
+    "RAY_AIR_NEW_OUTPUT": "0",
+}
+"""Environment variables, which Tune reads when it is imported: trials stay in this folder; Ctrl-C comes to us; what it
+would write for TensorBoard is in MLflow; between evaluations a trial only reports its iteration; we show progress."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +84,7 @@ def run(arguments: Sequence[str]) -> None:
             _collect(sweep)
             clock.lap("collect")
             tracker.wait_for_run_id()  # trials are its children
+            os.environ |= TUNE_SETTINGS
             from services.sweeps.tuning import tune_trials  # takes seconds to import: not for --help
 
             tune_trials(sweep)

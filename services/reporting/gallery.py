@@ -1,6 +1,5 @@
 """Draw the tasks of every suite, each as its expert solves it: the paper's Figures 6 to 9."""
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ from matplotlib import pyplot
 
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
 from dmil_core.errors import UserError
-from services.cli.arguments import exit_code, parse
+from services.cli.arguments import parse
 from services.cli.progress import Bar, console
 from services.rollouts.episodes import demonstrate
 from services.storage.files import room_for
@@ -105,7 +104,3 @@ def _at_work(suite: TaskSuite, camera: str | View, task: str, seed: int) -> UInt
     drawn = picture(env, camera, HEIGHT, WIDTH)
     env.close()
     return drawn
-
-
-if __name__ == "__main__":
-    sys.exit(exit_code(run, sys.argv[1:]))

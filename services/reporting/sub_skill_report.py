@@ -5,7 +5,6 @@ For example, with the variants of a sweep: python -m services.report sub-skills 
 experts demonstrate those that there are no demonstrations of.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ import torch
 import tyro
 
 from dmil_core.errors import UserError
-from services.cli.arguments import exit_code, parse
+from services.cli.arguments import parse
 from services.cli.progress import console
 from services.experiments.finished_run import FinishedRun
 from services.reporting.embedding import PERPLEXITY, SEED, embedding_section
@@ -119,7 +118,3 @@ def _runs_table(lineup: Lineup) -> DataTable:
         )
     head = ["run", "method", "sub-skills", "suite", "seed", "iterations", "fine-tuning steps", "learning rate"]
     return DataTable("The runs", [*head, "checkpoint"], rows)
-
-
-if __name__ == "__main__":
-    sys.exit(exit_code(run, sys.argv[1:]))

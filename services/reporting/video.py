@@ -3,7 +3,6 @@
 The episode is run again from its row of results. With --demonstration, one that was adapted to is shown beside it.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ import tyro
 
 from dmil_core.errors import UserError, shown
 from dmil_core.settings import sub_skills_of
-from services.cli.arguments import exit_code, parse
+from services.cli.arguments import parse
 from services.cli.progress import console
 from services.evaluation.results import EpisodeResult
 from services.experiments.finished_run import FinishedRun
@@ -139,7 +138,3 @@ def side_of(finished: FinishedRun, replayed: ReplayedEpisode) -> Side:
     ending = f"{'solved' if episode.success else 'not solved'} in {len(episode)} steps{score}"
     sub_skills = episode.sub_skills.tolist() if sub_skills_of(finished.config.method) > 1 else None
     return Side(title, replayed.recording.frames, len(episode), sub_skills, episode.success, ending)
-
-
-if __name__ == "__main__":
-    sys.exit(exit_code(run, sys.argv[1:]))

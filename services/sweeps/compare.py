@@ -2,7 +2,6 @@
 
 import re
 import shlex
-import sys
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from pathlib import Path
 import tyro
 
 from dmil_core.errors import UserError
-from services.cli.arguments import exit_code, parse
+from services.cli.arguments import parse
 from services.cli.progress import console
 from services.evaluation.comparison import Comparison, Contender, Place
 from services.experiments.finished_run import FinishedRun
@@ -184,7 +183,3 @@ def _contender(row: str, name: str, run: FinishedRun) -> Contender:
         home=run.folder,
         folder=run.folder,
     )
-
-
-if __name__ == "__main__":
-    sys.exit(exit_code(run, sys.argv[1:]))

@@ -20,10 +20,6 @@ from services.tracking.links import tracking_uri
 
 logger = logging.getLogger(__name__)
 
-# They tell of files that are not written, and of a lost process by its traceback.
-for _name in ("analysis.experiment_analysis", "execution.tune_controller"):
-    logging.getLogger(f"ray.tune.{_name}").setLevel(logging.CRITICAL)
-
 DEATHS_ALLOWED = 3
 """So often is a trial begun again whose process ended."""
 
@@ -109,6 +105,9 @@ def tune_trials(sweep: SweepFolder) -> None:
     left = [name for name, result in results.items() if result is None or result.status == "failed"]
     if not left:
         return
+    # They tell of files that are not written, and of a lost process by its traceback.
+    for name in ("analysis.experiment_analysis", "execution.tune_controller"):
+        logging.getLogger(f"ray.tune.{name}").setLevel(logging.CRITICAL)
     resources = sweep.record.sweep.resources
     if resources.workers > cpus():
         raise UserError(
