@@ -9,6 +9,7 @@ from jaxtyping import Float, Float32, Int64
 from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.settings import sub_skills_of
 from services.cli.progress import Bar
+from services.reporting.choices import shares_in_words, usage
 from services.reporting.drawing import Picture, colour_of, drawn, legend_of_markers, marker_of, panels
 from services.reporting.lineup import Lineup, has_sub_skills, policies
 from services.reporting.page import Part, Prose, Section
@@ -40,9 +41,7 @@ class _Panel(NamedTuple):
 def thin_out(demonstrations: Sequence[Demonstration], most: int) -> Thinned:
     """Keep every n-th state of each demonstration, its first one among them, with the least n that leaves few enough.
 
-    Args:
-        demonstrations: at least one.
-        most: states to be left; where there are more demonstrations than that, the first state of each is left.
+    Where there are more demonstrations than that, the first state of each is left.
     """
     lengths = [len(demonstration) for demonstration in demonstrations]
     every = next(n for n in range(1, max(lengths) + 1) if n == max(lengths) or sum(-(-x // n) for x in lengths) <= most)
@@ -68,11 +67,7 @@ def embed(states: Float[np.ndarray, "states obs_dim"], perplexity: float, seed: 
 def embedding_section(lineup: Lineup, shots: int = SHOTS, perplexity: float = PERPLEXITY, seed: int = SEED) -> Section:
     """Return a section with a picture for each task, of all runs whose methods have sub-skills.
 
-    Args:
-        lineup: the runs and tasks.
-        shots: demonstrations to adapt to.
-        perplexity: of t-SNE; a third of the states where there are few.
-        seed: of t-SNE.
+    The perplexity of t-SNE is a third of the states where there are few.
 
     Raises:
         UserError: if no demonstration is left to look at.
@@ -135,8 +130,5 @@ def _told(shown: Sequence[_Panel], kept: Thinned, support: int, others: int, per
 
 
 def _shares(panel: _Panel) -> str:
-    shares = np.bincount(panel.chosen, minlength=panel.sub_skills) / len(panel.chosen)
-    in_use = int((shares >= IN_USE).sum())
-    return f"{in_use} of {panel.sub_skills} sub-skills in use, " + ", ".join(
-        f"sub-skill {k} {share:.0%}" for k, share in enumerate(shares) if share
-    )
+    shares = usage([panel.chosen], panel.sub_skills).shares
+    return f"{(shares >= IN_USE).sum()} of {panel.sub_skills} sub-skills in use, {shares_in_words(shares)}"

@@ -10,11 +10,9 @@ import numpy as np
 from dmil_core.statistics import interval_text
 from services.evaluation.comparison import DIGITS, Cell, Comparison, Contender, Difference, Place, Unpaired
 from services.reporting.bands import curves
+from services.reporting.comparison_pictures import Runs, heat_map, means, profiles
 from services.reporting.drawing import Picture
-from services.reporting.heat_map import heat_map
-from services.reporting.means import means
 from services.reporting.page import Commands, DataTable, Part, Prose, Section, write_page
-from services.reporting.profiles import Runs, profiles
 from services.storage.checksums import sha256
 from services.suites.base import Split
 

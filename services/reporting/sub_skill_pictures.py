@@ -7,9 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Patch, PathPatch, Rectangle
 from matplotlib.path import Path as Outline
 
-from services.reporting.choices import Choices, Timeline
+from services.reporting.choices import Choices, Timeline, Usage, segments, shares_in_words
 from services.reporting.drawing import INK, Picture, colour_of, drawn, ink_on, legend_of_markers, marker_of, panels
-from services.reporting.usage import Usage, segments
 
 LEGIBLE = 0.05
 """A stretch gets its number, a bar its share, from this part of the width on."""
@@ -20,14 +19,7 @@ MOST_CELLS = 6
 
 
 def draw_timelines(title: str, shown: Sequence[Choices], on: str, most: int) -> Picture:
-    """Draw timelines as strips: a row of panels for each run, before adaptation on the left and after it on the right.
-
-    Args:
-        title: of the picture.
-        shown: the runs, each before and after adaptation.
-        on: which timelines.
-        most: so many of them in a panel.
-    """
+    """Draw timelines as strips, a row of panels for each run: before adaptation on the left, after it on the right."""
     kept = [(choice, choice.timelines[on][:most]) for choice in shown]
     longest = max(len(timeline.sub_skills) for _, timelines in kept for timeline in timelines)
     strips = max(len(timelines) for _, timelines in kept)
@@ -80,13 +72,7 @@ def _box(left: float, bottom: float, width: float, height: float) -> Outline:
 
 
 def draw_usage(title: str, shown: Sequence[Choices], kinds: Sequence[str]) -> Picture:
-    """Draw shares, dwell times and switches, a row for each run before and after adaptation on each kind of timelines.
-
-    Args:
-        title: of the picture.
-        shown: the runs, each before and after adaptation.
-        kinds: of timelines.
-    """
+    """Draw shares, dwell times and switches: a row for each run, before and after adaptation, and kind of timelines."""
     rows = [(choice, on, choice.usage(on)) for on in kinds for choice in shown if choice.timelines[on]]
     places = range(len(rows))
     with panels(1, 3, width=9.5, height=1.3 + 0.3 * len(rows)) as (figure, (shares, dwell, switches)):
@@ -108,7 +94,7 @@ def draw_usage(title: str, shown: Sequence[Choices], kinds: Sequence[str]) -> Pi
         shares.set_yticks(places, [f"{c.run}, {c.adaptation}, {short.get(on, on)}" for c, on, _ in rows])
         legend_of_markers(figure, _names(shown))
         told = "; ".join(
-            f"{choice.run} {choice.adaptation} adaptation in {on}: {_shares_in_words(use)}, {use.switches:.1f} "
+            f"{choice.run} {choice.adaptation} adaptation in {on}: {shares_in_words(use.shares)}, {use.switches:.1f} "
             "switches per episode"
             for choice, on, use in rows
         )
@@ -125,13 +111,7 @@ def _draw_shares(axis: Axes, place: int, use: Usage) -> None:
 
 
 def draw_transitions(title: str, shown: Sequence[Choices], on: str) -> Picture:
-    """Draw, for each run before and after adaptation, how often each sub-skill is followed by each.
-
-    Args:
-        title: of the picture.
-        shown: the runs, each before and after adaptation.
-        on: which timelines.
-    """
+    """Draw, for each run before and after adaptation, how often each sub-skill is followed by each."""
     kept = [(choice, choice.usage(on).followed) for choice in shown]
     columns = min(4, len(kept))
     rows = -(-len(kept) // columns)
@@ -173,11 +153,7 @@ def _told(shown: Sequence[Choices], on: str) -> str:
         if timelines := choice.timelines[on]:
             use = choice.usage(on)
             parts.append(
-                f"{choice.run} {choice.adaptation} adaptation: {_shares_in_words(use)} of the steps of "
+                f"{choice.run} {choice.adaptation} adaptation: {shares_in_words(use.shares)} of the steps of "
                 f"{len(timelines)} {on}, {use.switches:.1f} switches in each"
             )
     return "; ".join(parts) + "."
-
-
-def _shares_in_words(use: Usage) -> str:
-    return ", ".join(f"sub-skill {k} {share:.0%}" for k, share in enumerate(use.shares) if share)

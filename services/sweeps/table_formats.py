@@ -15,7 +15,7 @@ from services.cli.arguments import parse
 from services.cli.progress import console
 from services.evaluation.comparison import DIGITS, Cell, Difference, Unpaired
 from services.evaluation.summary import markdown_rows
-from services.reporting.means import draw_means
+from services.reporting.comparison_pictures import draw_means
 from services.storage.files import write_file
 from services.storage.run_folders import find_folder
 from services.sweeps.compare import write_sweep_page

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.reporting.usage import Segment, segments, usage
+from services.reporting.choices import Segment, segments, usage
 
 
 def timeline(*sub_skills: int) -> np.ndarray:
