@@ -5,19 +5,16 @@ which do not fit a core's own cache: the time that reading as many bytes takes, 
 action reads the decoder's weights and the encoder's view of the demonstration; it has no twin here.
 """
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
 import torch
-from rich.table import Table
 from torch import Tensor
 
+from benchmarks.harness import BenchmarkArguments, Row, alternate, lay_out, main
 from benchmarks.masked_twin import MaskedTwin
-from benchmarks.timing import alternate, write_rows
 from benchmarks.workload import ACTION_DIM, OBS_DIM, as_in_a_run, draw_parameters, draw_steps, settings
 from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.methods.base import FineTuning
@@ -26,7 +23,6 @@ from dmil_core.methods.dmil.policy import DmilPolicy
 from dmil_core.methods.mil.config import MilConfig
 from dmil_core.methods.mil.method import Mil
 from dmil_core.seeding import named_rng
-from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 
 CALLS = 200
@@ -34,7 +30,7 @@ CALLS = 200
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(BenchmarkArguments):
     """Arguments of ``benchmarks.adaptation``."""
 
     sub_skills: int = 3
@@ -45,8 +41,6 @@ class Arguments:
     """Steps of adaptation."""
     rounds: int = 9
     """How often each is timed; the table shows medians."""
-    json: Path | None = None
-    """Write the rows to this file."""
 
 
 class Contest(NamedTuple):
@@ -58,19 +52,12 @@ class Contest(NamedTuple):
     target: float
 
 
-def run(arguments: Sequence[str]) -> None:
+def run(given: Arguments) -> Sequence[Row]:
     """Run the benchmark."""
-    given = parse(Arguments, __doc__ or "", arguments, Arguments())
     torch.set_num_threads(1)
-    rows = [_measure(contest, given.rounds) for contest in _contests(given)]
-    console.print(_table(rows))
-    if given.json:
-        write_rows(given.json, rows)
-        console.print(f"rows: {given.json}")
-
-
-def _contests(given: Arguments) -> list[Contest]:
-    return [*_dmil(given), _mil(given)]
+    rows = [_measure(contest, given.rounds) for contest in (*_dmil(given), _mil(given))]
+    console.print(lay_out("adaptation and acting on one core", [_cells(row) for row in rows]))
+    return rows
 
 
 def _mil(given: Arguments) -> Contest:
@@ -143,21 +130,16 @@ def _measure(contest: Contest, rounds: int) -> dict[str, Any]:
     }
 
 
-def _table(rows: Sequence[dict[str, Any]]) -> Table:
-    table = Table(title="adaptation and acting on one core")
-    for column in ("what", "ours", "at most", "twin", "faster", "reading the weights"):
-        table.add_column(column, justify="left" if column == "what" else "right")
-    for row in rows:
-        verdict = "met" if row["seconds"] <= row["target_seconds"] else "missed"
-        table.add_row(
-            row["what"],
-            _in_words(row["seconds"]),
-            f"{_in_words(row['target_seconds'])} ({verdict})",
-            _in_words(row["twin_seconds"]),
-            f"{row['ratio']:.2f}x" if row["ratio"] else "",
-            _in_words(row["floor_seconds"]),
-        )
-    return table
+def _cells(row: Row) -> dict[str, str]:
+    verdict = "met" if row["seconds"] <= row["target_seconds"] else "missed"
+    return {
+        "what": row["what"],
+        "ours": _in_words(row["seconds"]),
+        "at most": f"{_in_words(row['target_seconds'])} ({verdict})",
+        "twin": _in_words(row["twin_seconds"]),
+        "faster": f"{row['ratio']:.2f}x" if row["ratio"] else "",
+        "reading the weights": _in_words(row["floor_seconds"]),
+    }
 
 
 def _in_words(seconds: float | None) -> str:
@@ -167,4 +149,4 @@ def _in_words(seconds: float | None) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code(run, sys.argv[1:]))
+    main(run, Arguments(), __doc__)

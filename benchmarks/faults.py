@@ -6,7 +6,6 @@ What a kill of each kind cost is estimated from the runs' seconds by least squar
 """
 
 import hashlib
-import json
 import os
 import random
 import shutil
@@ -17,6 +16,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,12 +24,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import psutil
 from rich.box import SIMPLE
-from rich.table import Table
 from scipy.optimize import nnls
 
-from services.cli.arguments import exit_code, parse
+from benchmarks.harness import BenchmarkArguments, Row, lay_out, main
 from services.cli.progress import Bar, console
-from services.storage.files import write_file
 
 VICTIMS = {"worker": 7, "all workers": 1, "learner": 2, "driver": 1}
 """What is killed, and how often against the others."""
@@ -49,7 +47,7 @@ ATTEMPTS = 3
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(BenchmarkArguments):
     """Arguments of ``faults``."""
 
     kills: int = 200
@@ -58,8 +56,6 @@ class Arguments:
     """Of the moments and the victims."""
     folder: Path | None = None
     """Keep demonstrations and runs here; else they go when all is over."""
-    json: Path | None = None
-    """File for the result."""
 
 
 class Outcome(NamedTuple):
@@ -179,10 +175,8 @@ def _title(process: psutil.Process) -> str:
 
 def _kill(processes: Sequence[Any]) -> None:
     for process in processes:
-        try:
+        with suppress(psutil.NoSuchProcess):
             process.kill()
-        except psutil.NoSuchProcess:
-            continue
 
 
 def _costs(outcomes: Sequence[Outcome], undisturbed: float) -> dict[str, float]:
@@ -193,17 +187,15 @@ def _costs(outcomes: Sequence[Outcome], undisturbed: float) -> dict[str, float]:
     return dict(zip(VICTIMS, map(float, seconds), strict=True))
 
 
-def _table(outcomes: Sequence[Outcome], wanted: str | None, costs: dict[str, float]) -> Table:
-    view = Table(title="Kills, by what became of the runs that they struck", box=SIMPLE)
-    for column in ("killed", "kills", "survived", "lost", "different", "seconds each cost"):
-        view.add_column(column, justify="left" if column == "killed" else "right")
-    for kind in (*VICTIMS, "all"):
-        parts = _counts(outcomes, wanted, kind)
-        cost = f"{costs[kind]:.1f}" if kind in costs else ""
-        view.add_row(
-            kind, str(sum(parts.values())), *(str(parts[name]) for name in ("equal", "lost", "different")), cost
-        )
-    return view
+def _cells(kind: str, counts: Counter[str], cost: float | None) -> dict[str, str]:
+    return {
+        "killed": kind,
+        "kills": str(counts.total()),
+        "survived": str(counts["equal"]),
+        "lost": str(counts["lost"]),
+        "different": str(counts["different"]),
+        "seconds each cost": "" if cost is None else f"{cost:.1f}",
+    }
 
 
 def _counts(outcomes: Sequence[Outcome], wanted: str | None, kind: str = "all") -> Counter[str]:
@@ -214,9 +206,8 @@ def _counts(outcomes: Sequence[Outcome], wanted: str | None, kind: str = "all") 
     return found
 
 
-def run(arguments: Sequence[str]) -> None:
+def run(given: Arguments) -> Row:
     """Run the benchmark."""
-    given = parse(Arguments, __doc__ or "", arguments, Arguments())
     folder = given.folder or Path(tempfile.mkdtemp(prefix="dmil-faults-"))
     folder.mkdir(parents=True, exist_ok=True)
     campaign = Campaign(folder.resolve(), random.Random(given.seed))
@@ -234,17 +225,15 @@ def run(arguments: Sequence[str]) -> None:
             shutil.rmtree(folder, ignore_errors=True)
     counts = _counts(outcomes, undisturbed.found)
     costs = _costs(outcomes, undisturbed.seconds)
-    console.print(_table(outcomes, undisturbed.found, costs))
+    cells = [_cells(kind, _counts(outcomes, undisturbed.found, kind), costs.get(kind)) for kind in (*VICTIMS, "all")]
+    console.print(lay_out("Kills, by what became of the runs that they struck", cells, box=SIMPLE))
     console.print(
         f"{len(outcomes)} runs of {undisturbed.seconds:.0f} s undisturbed; {counts['equal']} of {counts.total()} kills "
         "struck runs that ended with the same bits"
     )
-    if given.json is not None:
-        row = {"kills": counts.total(), **{name: counts[name] for name in ("equal", "lost", "different")}}
-        row |= {"runs": len(outcomes), "seconds": undisturbed.seconds, "cost": costs}
-        given.json.parent.mkdir(parents=True, exist_ok=True)
-        write_file(given.json, json.dumps(row, indent=1) + "\n")
+    row = {"kills": counts.total(), **{name: counts[name] for name in ("equal", "lost", "different")}}
+    return row | {"runs": len(outcomes), "seconds": undisturbed.seconds, "cost": costs}
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code(run, sys.argv[1:]))
+    main(run, Arguments(), __doc__)

@@ -7,7 +7,6 @@ that the caches are as cold.
 """
 
 import itertools
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -18,16 +17,14 @@ from statistics import median
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import torch
-from rich.table import Table
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from benchmarks.harness import BenchmarkArguments, Row, alternate, lay_out, main
 from benchmarks.masked_twin import MaskedTwin
-from benchmarks.timing import alternate, write_rows
 from benchmarks.workload import OBS_DIM, Size, as_in_a_run, draw_parameters, draw_sets, settings
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.dmil.meta_gradient import task_gradient
-from services.cli.arguments import exit_code, parse
 from services.cli.progress import Bar, console
 
 WORKERS = 2
@@ -39,7 +36,7 @@ ROOFLINE_TARGET = 0.85
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(BenchmarkArguments):
     """Arguments of ``benchmarks.meta_gradient``."""
 
     sizes: tuple[Size, ...] = ("paper", "quick")
@@ -50,8 +47,6 @@ class Arguments:
     """Of the meta-gradient."""
     rounds: int = 7
     """How often each rival is timed; the table shows medians."""
-    json: Path | None = None
-    """Write the rows to this file."""
 
 
 Place: TypeAlias = tuple[int, tuple[int, ...], tuple[int, ...]]
@@ -203,26 +198,21 @@ def _forward_operations(config: DmilConfig, steps: int) -> float:
     return 2.0 * steps * config.hidden_units * (OBS_DIM + (config.hidden_layers - 1) * config.hidden_units)
 
 
-def _table(rows: Sequence[dict[str, Any]]) -> Table:
-    table = Table(title=f"one task's meta-gradient: ours on {WORKERS} workers, the twin on {WORKERS} threads")
-    for column in ("size", "order", "K", "ours", "twin", "faster", "of the roofline", "work", "peak", "error"):
-        table.add_column(column, justify="left" if column in ("size", "order") else "right")
-    for row in rows:
-        wanted = TARGETS.get((row["size"], row["order"], row["k"]))
-        share = ROOFLINE_TARGET if row["size"] == "paper" and row["order"] == "second" else None
-        table.add_row(
-            row["size"],
-            row["order"],
-            str(row["k"]),
-            f"{row['seconds'] * 1e3:.1f} ms",
-            f"{row['twin_seconds'] * 1e3:.1f} ms",
-            f"{row['ratio']:.2f}x" + _verdict(row["ratio"], wanted, "x"),
-            f"{row['roofline_share']:.0%}" + _verdict(row["roofline_share"], share, ""),
-            f"{row['forwards']:.0f} F",
-            f"{row['peak_mb']:.0f} MB",
-            f"{row['relative_error']:.0e}",
-        )
-    return table
+def _cells(row: Row) -> dict[str, str]:
+    wanted = TARGETS.get((row["size"], row["order"], row["k"]))
+    share = ROOFLINE_TARGET if row["size"] == "paper" and row["order"] == "second" else None
+    return {
+        "size": row["size"],
+        "order": row["order"],
+        "K": str(row["k"]),
+        "ours": f"{row['seconds'] * 1e3:.1f} ms",
+        "twin": f"{row['twin_seconds'] * 1e3:.1f} ms",
+        "faster": f"{row['ratio']:.2f}x" + _verdict(row["ratio"], wanted, "x"),
+        "of the roofline": f"{row['roofline_share']:.0%}" + _verdict(row["roofline_share"], share, ""),
+        "work": f"{row['forwards']:.0f} F",
+        "peak": f"{row['peak_mb']:.0f} MB",
+        "error": f"{row['relative_error']:.0e}",
+    }
 
 
 def _verdict(value: float, wanted: float | None, unit: str) -> str:
@@ -231,9 +221,8 @@ def _verdict(value: float, wanted: float | None, unit: str) -> str:
     return f" ({'meets' if value >= wanted else 'misses'} {wanted}{unit})"
 
 
-def run(arguments: Sequence[str]) -> None:
+def run(given: Arguments) -> Sequence[Row]:
     """Run the benchmark."""
-    given = parse(Arguments, __doc__ or "", arguments, Arguments())
     torch.set_num_threads(WORKERS)
     plan = list(itertools.product(given.sizes, given.orders, given.sub_skills))
     rows = []
@@ -241,11 +230,10 @@ def run(arguments: Sequence[str]) -> None:
         for size, order, k in plan:
             rows.append(measure(size, order, k, given.rounds))
             bar.advance(1, f"{size}, {order} order, K = {k}")
-    console.print(_table(rows))
-    if given.json:
-        write_rows(given.json, rows)
-        console.print(f"rows: {given.json}")
+    title = f"one task's meta-gradient: ours on {WORKERS} workers, the twin on {WORKERS} threads"
+    console.print(lay_out(title, [_cells(row) for row in rows], words=2))
+    return rows
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code(run, sys.argv[1:]))
+    main(run, Arguments(), __doc__)

@@ -9,22 +9,19 @@ is what is left of the iteration beside an ideal one: 1 - (worker compute second
 seconds. So waiting for the slower worker counts as overhead too.
 """
 
-import os
-import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from functools import partial
+from typing import Literal, NamedTuple
 
 import numpy as np
 from rich.box import SIMPLE
-from rich.table import Table
 
+from benchmarks import harness
 from benchmarks.cluster_model import calls_of_a_tree
-from benchmarks.timing import alternate, write_rows
+from benchmarks.harness import BenchmarkArguments, alternate, lay_out, machine, main
 from benchmarks.workload import Size, made_up_plan
 from dmil_core.configs import PRESETS
-from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.distributed.ray_meta_training import FAN_IN, RayMetaTraining
 from services.distributed.ray_runner import RayRunner
@@ -53,15 +50,13 @@ SPEEDUP = 1.85
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(BenchmarkArguments):
     """Arguments of ``scaling``."""
 
     sizes: tuple[Size, ...] = ("quick", "paper")
     """Networks, batches and windows of the presets ml10-quick and ml10-paper."""
     rounds: int | None = None
     """Turns that each takes; by default 6 at quick size and 2 at paper size."""
-    json: Path | None = None
-    """File for the rows."""
 
 
 class Row(NamedTuple):
@@ -85,14 +80,11 @@ def measure(trainings: Mapping[str, MetaTraining], turns: Turns) -> dict[str, li
     """Let rivals meta-train in turns, and return the timing of each one's iterations."""
     timings: dict[str, list[Timing]] = {name: [] for name in trainings}
 
-    def turn(name: str) -> Callable[[], None]:
-        def go_on() -> None:
-            iterations = list(trainings[name].iterations(1 + turns.iterations))
-            timings[name] += [iteration.timing for iteration in iterations[1:]]
+    def turn(name: str) -> None:
+        iterations = list(trainings[name].iterations(1 + turns.iterations))
+        timings[name] += [iteration.timing for iteration in iterations[1:]]
 
-        return go_on
-
-    alternate({name: turn(name) for name in trainings}, turns.rounds)
+    alternate({name: partial(turn, name) for name in trainings}, turns.rounds)
     return timings
 
 
@@ -136,32 +128,23 @@ def misses(rows: Sequence[Row]) -> list[str]:
     return found
 
 
-def table(rows: Sequence[Row]) -> Table:
-    """Lay the rows out for the terminal."""
-    view = Table(
-        title="Iterations a second, and of one iteration milliseconds and MB of parameters and gradients", box=SIMPLE
-    )
-    columns = ("size", "runner", "workers", "it/s", "speedup", "overhead")
-    for column in (*columns, *Timing._fields, "MB out", "MB in"):
-        view.add_column(column, justify="left" if column in ("size", "runner") else "right")
-    for row in rows:
-        view.add_row(
-            row.size,
-            row.runner,
-            str(row.workers),
-            f"{row.iterations_per_s:.3g}",
-            f"{row.speedup:.2f}",
-            f"{row.overhead_share:.1%}",
-            *(f"{1e3 * seconds:.1f}" for seconds in row.seconds),
-            f"{row.parameter_bytes / 1e6:.1f}",
-            f"{row.gradient_bytes / 1e6:.1f}",
-        )
-    return view
+def cells(row: Row) -> dict[str, str]:
+    """Return the row of the table."""
+    return {
+        "size": row.size,
+        "runner": row.runner,
+        "workers": str(row.workers),
+        "it/s": f"{row.iterations_per_s:.3g}",
+        "speedup": f"{row.speedup:.2f}",
+        "overhead": f"{row.overhead_share:.1%}",
+        **{name: f"{1e3 * seconds:.1f}" for name, seconds in row.seconds._asdict().items()},
+        "MB out": f"{row.parameter_bytes / 1e6:.1f}",
+        "MB in": f"{row.gradient_bytes / 1e6:.1f}",
+    }
 
 
-def run(arguments: Sequence[str]) -> None:
+def run(given: Arguments) -> Sequence[harness.Row]:
     """Run the benchmark."""
-    given = parse(Arguments, __doc__ or "", arguments, Arguments())
     rows: list[Row] = []
     runner = RayRunner(MetaWorldSuite(PRESETS["ml10-quick"].suite), sum(WORKERS))
     try:
@@ -177,13 +160,13 @@ def run(arguments: Sequence[str]) -> None:
                 training.close()
     finally:
         runner.close()
-    console.print(table(rows))
-    console.print(f"{os.cpu_count()} CPUs, load average {os.getloadavg()[0]:.1f}")
+    title = "Iterations a second, and of one iteration milliseconds and MB of parameters and gradients"
+    console.print(lay_out(title, [cells(row) for row in rows], words=2, box=SIMPLE))
+    here = machine()
+    console.print(f"{here['cpus']} CPUs, load average {here['load_average']:.1f}")
     console.print("\n".join(f"missed: {line}" for line in misses(rows)) or "all targets are met")
-    if given.json is not None:
-        machine: dict[str, Any] = {"cpus": os.cpu_count(), "load_average": os.getloadavg()[0]}
-        write_rows(given.json, [row._asdict() | {"seconds": row.seconds._asdict()} | machine for row in rows])
+    return [row._asdict() | {"seconds": row.seconds._asdict()} | here for row in rows]
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code(run, sys.argv[1:]))
+    main(run, Arguments(), __doc__)

@@ -9,14 +9,12 @@ Everything shares the cores that the process may use, so ``taskset -c 0`` measur
 """
 
 import os
-import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
-from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
@@ -26,9 +24,8 @@ import mujoco as compiled_mujoco
 import numpy as np
 import torch
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
-from rich.table import Table
 
-from benchmarks.timing import alternate, write_rows
+from benchmarks.harness import BenchmarkArguments, Row, alternate, lay_out, main
 from dmil_core.configs import PRESETS, EvaluationConfig, SuiteConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import FineTuning, Policy
@@ -36,7 +33,6 @@ from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.dmil.method import Dmil
 from dmil_core.networks import Parameters, flatten
 from dmil_core.seeding import named_rng
-from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.distributed.simulation_worker import SimulationWorker
 from services.distributed.work_items import AdaptationRollouts
@@ -57,7 +53,7 @@ TRAILING_STEPS = 10
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(BenchmarkArguments):
     """Arguments of ``benchmarks.simulation``."""
 
     tasks: tuple[str, ...] = tuple(task for part in SPLITS["ml10"] for task in part)
@@ -78,13 +74,10 @@ class Arguments:
     """Of the policy that both evaluations drive, on demonstrations of all evaluation tasks together."""
     quick: bool = False
     """Two tasks, one round, a small evaluation: to see that it runs."""
-    json: Path | None = None
-    """Write the rows to this file."""
 
 
-def run(arguments: Sequence[str]) -> None:
+def run(given: Arguments) -> Sequence[Row]:
     """Run the benchmark."""
-    given = parse(Arguments, __doc__ or "", arguments, Arguments())
     if given.quick:
         given = Arguments(
             tasks=given.tasks[:2],
@@ -95,7 +88,6 @@ def run(arguments: Sequence[str]) -> None:
             evaluation_rounds=1,
             horizon=50,
             fine_tuning_steps=5,
-            json=given.json,
         )
     torch.set_num_threads(1)
     rows: list[dict[str, Any]] = []
@@ -104,15 +96,14 @@ def run(arguments: Sequence[str]) -> None:
         rows.append(step_row(suite, task, given.episodes, given.rounds))
         console.print(f"{task}: {rows[-1]['ratio']:.2f} times stock")
     rows.append(median_row(rows))
-    console.print(steps_table(rows))
+    console.print(lay_out("Steps per second and core, driven by the experts", [step_cells(row) for row in rows]))
     verdict("steps/s over stock, median over tasks", rows[-1]["ratio"], STEPS_TARGET)
     verdict("steps/s over bare physics, median over tasks", rows[-1]["physics_share"], PHYSICS_TARGET)
     if given.evaluation_rounds:
         rows.append(evaluation_row(given))
-        console.print(evaluation_table(rows[-1]))
+        print_evaluation(rows[-1])
         verdict("whole evaluations over Meta-World's", rows[-1]["ratio"], EVALUATION_TARGET)
-    if given.json is not None:
-        write_rows(given.json, rows)
+    return rows
 
 
 def verdict(what: str, got: float, target: float) -> None:
@@ -218,21 +209,18 @@ def step_row(suite: MetaWorldSuite, task: str, episodes: int, rounds: int) -> di
     }
 
 
-def median_row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def median_row(rows: Sequence[Row]) -> dict[str, Any]:
     """Return the median over tasks of each column."""
     columns = [name for name in rows[0] if name not in ("task", "steps", "rounds")]
     return {"task": "median", "tasks": len(rows), **{name: median(row[name] for row in rows) for name in columns}}
 
 
-def steps_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Show the rows of tasks and their median."""
-    view = Table(title="Steps per second and core, driven by the experts")
-    for column in ("task", "stock", "ours", "physics alone", "ours / stock", "ours / physics"):
-        view.add_column(column, justify="left" if column == "task" else "right")
-    for row in rows:
-        rates = (f"{row[f'{name}_steps_per_s']:.0f}" for name in ("stock", "ours", "physics"))
-        view.add_row(row["task"], *rates, f"{row['ratio']:.2f}", f"{row['physics_share']:.2f}")
-    return view
+def step_cells(row: Row) -> dict[str, str]:
+    """Return the table's cells of a task, or of the median."""
+    names = {"stock": "stock", "ours": "ours", "physics alone": "physics"}
+    rates = {head: f"{row[f'{name}_steps_per_s']:.0f}" for head, name in names.items()}
+    ratios = {"ours / stock": f"{row['ratio']:.2f}", "ours / physics": f"{row['physics_share']:.2f}"}
+    return {"task": row["task"]} | rates | ratios
 
 
 # Whole evaluations
@@ -360,22 +348,25 @@ def evaluation_row(given: Arguments) -> dict[str, Any]:
     }
 
 
-def evaluation_table(row: Mapping[str, Any]) -> Table:
-    """Show the row of the evaluations."""
-    view = Table(
-        title=f"{row['episodes']} episodes x {row['tasks']} tasks of {row['horizon']} steps, cores: {row['cores']}",
-        caption="An episode ends at success in both. Meta-World's go on in all environments until the slowest task has "
-        "its episodes; ours are done when they are. Environments are built before.",
+def print_evaluation(row: Row) -> None:
+    """Print the row of the evaluations."""
+    title = f"{row['episodes']} episodes x {row['tasks']} tasks of {row['horizon']} steps, cores: {row['cores']}"
+    caption = (
+        "An episode ends at success in both. Meta-World's go on in all environments until the slowest task has "
+        "its episodes; ours are done when they are. Environments are built before."
     )
-    for column in ("", "seconds", "steps executed", "steps/s", "share of the policy"):
-        view.add_column(column, justify="right" if column else "left")
-    for name, title in (("stock", "metaworld.evaluation"), ("ours", "ours")):
-        seconds, steps = row[f"{name}_seconds"], row[f"{name}_steps"]
-        view.add_row(
-            title, f"{seconds:.2f}", f"{steps:.0f}", f"{steps / seconds:.0f}", f"{row[f'{name}_policy_share']:.0%}"
-        )
-    return view
+    cells = [
+        {
+            "": whose,
+            "seconds": f"{row[f'{name}_seconds']:.2f}",
+            "steps executed": f"{row[f'{name}_steps']:.0f}",
+            "steps/s": f"{row[f'{name}_steps'] / row[f'{name}_seconds']:.0f}",
+            "share of the policy": f"{row[f'{name}_policy_share']:.0%}",
+        }
+        for name, whose in (("stock", "metaworld.evaluation"), ("ours", "ours"))
+    ]
+    console.print(lay_out(title, cells, caption=caption))
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code(run, sys.argv[1:]))
+    main(run, Arguments(), __doc__)

@@ -6,25 +6,23 @@ call, the driver's share of one, and a write into the object store in seconds, o
 network is assumed, and `benchmarks.cluster_model` puts all together.
 """
 
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from rich.box import SIMPLE
-from rich.table import Table
 
+from benchmarks import harness
 from benchmarks.cluster_model import Costs, Network, Prediction, predict, seconds_of_a_tree
-from benchmarks.timing import write_rows
+from benchmarks.harness import BenchmarkArguments, alternate, lay_out, main
 from benchmarks.workload import made_up_plan
 from dmil_core.configs import PRESETS
 from dmil_core.networks import unflatten
 from dmil_core.outer_loop import add, group_gradient
-from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.distributed.chunking import to_chunks
 from services.distributed.learner import Learner
@@ -38,7 +36,7 @@ CALLS = 200
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(BenchmarkArguments):
     """Arguments of ``sizing``."""
 
     presets: tuple[str, ...] = ("ml10-quick", "ml10-paper", "ml45-paper")
@@ -51,8 +49,6 @@ class Arguments:
     """Of a CPU's hour, in dollars: an assumption."""
     faster: float = 1.0
     """Predict for a slot computed so many times as fast, as on a GPU: an assumption too."""
-    json: Path | None = None
-    """File for the rows."""
 
 
 class Row(NamedTuple):
@@ -90,15 +86,10 @@ class Row(NamedTuple):
     """Of all workers in these hours."""
 
 
-def least(rounds: int, work: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
+def least(rounds: int, work: Callable[[], object], clock: Callable[[], float] | None = None) -> float:
     """Return the least seconds of some work, done once beforehand."""
     work()
-    found = []
-    for _ in range(rounds):
-        began = clock()
-        work()
-        found.append(clock() - began)
-    return min(found)
+    return min(alternate({"work": work}, rounds, clock=clock)["work"])
 
 
 def slot_seconds(plan: Plan, rounds: int) -> list[float]:
@@ -193,47 +184,36 @@ def row(arguments: Arguments, preset: str, costs: Costs, workers: int, slots: in
     )
 
 
-def as_it_is(rows: Sequence[Row]) -> Table:
-    """Lay out what more workers do for a preset as it is."""
-    view = Table(title="The preset as it is", box=SIMPLE)
-    for column in ("workers", "used", "s/iteration", "speedup", "efficiency", "hours", "CPU hours", "$"):
-        view.add_column(column, justify="right")
-    for this in rows:
-        view.add_row(
-            f"{this.workers:,}",
-            str(this.used),
-            f"{this.iteration:.3g}",
-            f"{this.efficiency * this.workers:.2f}",
-            f"{this.efficiency:.1%}",
-            f"{this.hours:.2f}",
-            f"{this.hours * this.workers:.1f}",
-            f"{this.dollars:.2f}",
-        )
-    return view
+def cells_as_it_is(row: Row) -> dict[str, str]:
+    """Return the cells of what more workers do for a preset as it is."""
+    return {
+        "workers": f"{row.workers:,}",
+        "used": str(row.used),
+        "s/iteration": f"{row.iteration:.3g}",
+        "speedup": f"{row.efficiency * row.workers:.2f}",
+        "efficiency": f"{row.efficiency:.1%}",
+        "hours": f"{row.hours:.2f}",
+        "CPU hours": f"{row.hours * row.workers:.1f}",
+        "$": f"{row.dollars:.2f}",
+    }
 
 
-def grown(rows: Sequence[Row]) -> Table:
-    """Lay out what is expected where an iteration has a group of slots for each worker."""
-    view = Table(title="Another experiment: a group of slots for each worker", box=SIMPLE)
-    columns = ("workers", "slots", "s/iteration", "efficiency", "if relayed", "learner", "MB/s sent")
-    for column in (*columns, "MB store", "GB a node", "tree", "alone", "largest"):
-        view.add_column(column, justify="right")
-    for this in rows:
-        view.add_row(
-            f"{this.workers:,}",
-            f"{this.slots:,}",
-            f"{this.iteration:.3g}",
-            f"{this.efficiency:.0%}",
-            f"{this.efficiency_relayed:.0%}",
-            f"{this.learner:.1%}",
-            f"{this.sent / 1e6:.0f}",
-            f"{this.store / 1e6:.0f}",
-            f"{this.memory / 1e9:.1f}",
-            f"{this.tree:.3f} s",
-            f"{this.alone:.3f} s",
-            this.largest,
-        )
-    return view
+def cells_grown(row: Row) -> dict[str, str]:
+    """Return the cells of what is expected where an iteration has a group of slots for each worker."""
+    return {
+        "workers": f"{row.workers:,}",
+        "slots": f"{row.slots:,}",
+        "s/iteration": f"{row.iteration:.3g}",
+        "efficiency": f"{row.efficiency:.0%}",
+        "if relayed": f"{row.efficiency_relayed:.0%}",
+        "learner": f"{row.learner:.1%}",
+        "MB/s sent": f"{row.sent / 1e6:.0f}",
+        "MB store": f"{row.store / 1e6:.0f}",
+        "GB a node": f"{row.memory / 1e9:.1f}",
+        "tree": f"{row.tree:.3f} s",
+        "alone": f"{row.alone:.3f} s",
+        "largest": row.largest,
+    }
 
 
 def in_words(costs: Costs) -> str:
@@ -246,9 +226,8 @@ def in_words(costs: Costs) -> str:
     )
 
 
-def run(arguments: Sequence[str]) -> None:
+def run(given: Arguments) -> Sequence[harness.Row]:
     """Run the benchmark."""
-    given = parse(Arguments, __doc__ or "", arguments, Arguments())
     network, rows = Network(), list[Row]()
     console.print(
         f"assumed: {network.workers_per_node} workers a node, {network.bytes_per_second * 8e-9:.0f} Gbit/s and "
@@ -265,14 +244,15 @@ def run(arguments: Sequence[str]) -> None:
             costs = costs._replace(slot=costs.slot / given.faster)
             fixed = [row(given, preset, costs, workers, training.tasks_per_iteration) for workers in given.workers]
             each = [row(given, preset, costs, workers, workers * training.slots_per_group) for workers in given.workers]
-            console.print(as_it_is(fixed), grown(each))
+            console.print(lay_out("The preset as it is", [*map(cells_as_it_is, fixed)], words=0, box=SIMPLE))
+            title = "Another experiment: a group of slots for each worker"
+            console.print(lay_out(title, [*map(cells_grown, each)], words=0, box=SIMPLE))
             rows += fixed + each
     finally:
         runner.close()
-    if given.json is not None:
-        machine: dict[str, Any] = {"fan_in": FAN_IN, "price": given.price, "faster": given.faster}
-        write_rows(given.json, [row._asdict() | machine for row in rows])
+    assumed = {"fan_in": FAN_IN, "price": given.price, "faster": given.faster}
+    return [row._asdict() | assumed for row in rows]
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code(run, sys.argv[1:]))
+    main(run, Arguments(), __doc__)

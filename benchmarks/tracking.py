@@ -7,24 +7,23 @@ tracking of the same round; a second run without tracking shows how far such a r
 """
 
 import os
-import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from rich.box import SIMPLE
-from rich.table import Table
 
-from benchmarks.timing import alternate, write_rows
+from benchmarks import harness
+from benchmarks.harness import BenchmarkArguments, alternate, lay_out, machine, main
 from benchmarks.workload import made_up_plan
-from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.distributed.runner import Iteration, LocalMetaTraining
 from services.tracking.delivery import Identity
@@ -41,15 +40,13 @@ CONTROL = "no tracking, again"
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(BenchmarkArguments):
     """Arguments of ``tracking``."""
 
     rounds: int = 24
     """Turns that each takes."""
     iterations: int = 5
     """Of one turn."""
-    json: Path | None = None
-    """File for the rows."""
 
 
 class Row(NamedTuple):
@@ -156,49 +153,37 @@ def measure(folder: Path, slow: str, rounds: int, iterations: int) -> list[Row]:
     for each in runs.values():
         each.go_on(WARM_UP)
         each.cpu_seconds.clear()
-
-    def turn(each: Run) -> Callable[[], None]:
-        return lambda: each.go_on(iterations)
-
-    seconds = alternate({name: turn(each) for name, each in runs.items()}, rounds)
-    cpu = runs[NONE].cpu_seconds
-    return [each.row(seconds, cpu, iterations) for each in runs.values()]
+    seconds = alternate({name: partial(each.go_on, iterations) for name, each in runs.items()}, rounds)
+    return [each.row(seconds, runs[NONE].cpu_seconds, iterations) for each in runs.values()]
 
 
-def table(rows: Sequence[Row]) -> Table:
-    """Lay the rows out for the terminal."""
-    view = Table(title="Meta-training of the quick size beside MLflow", box=SIMPLE)
-    for column in ("MLflow", "iterations", "it/s", "of none", "by CPU time", "µs a call", "records", "delivered"):
-        view.add_column(column, justify="left" if column == "MLflow" else "right")
-    for row in rows:
-        view.add_row(
-            row.mlflow,
-            str(row.iterations),
-            f"{row.iterations_per_s:.2f}",
-            f"{row.ratio:.3f}",
-            f"{row.cpu_ratio:.3f}",
-            f"{row.call_us:.0f}",
-            str(row.records),
-            str(row.delivered),
-        )
-    return view
+def cells(row: Row) -> dict[str, str]:
+    """Return the row of the table."""
+    return {
+        "MLflow": row.mlflow,
+        "iterations": str(row.iterations),
+        "it/s": f"{row.iterations_per_s:.2f}",
+        "of none": f"{row.ratio:.3f}",
+        "by CPU time": f"{row.cpu_ratio:.3f}",
+        "µs a call": f"{row.call_us:.0f}",
+        "records": str(row.records),
+        "delivered": str(row.delivered),
+    }
 
 
-def run(arguments: Sequence[str]) -> None:
+def run(given: Arguments) -> Sequence[harness.Row]:
     """Run the benchmark."""
-    given = parse(Arguments, __doc__ or "", arguments, Arguments())
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)))
         rows = measure(folder, stack.enter_context(slow_server()), given.rounds, given.iterations)
-    console.print(table(rows))
-    console.print(f"{os.cpu_count()} CPUs, load average {os.getloadavg()[0]:.1f}, {given.rounds} rounds")
+    console.print(lay_out("Meta-training of the quick size beside MLflow", [cells(row) for row in rows], box=SIMPLE))
+    here = machine()
+    console.print(f"{here['cpus']} CPUs, load average {here['load_average']:.1f}, {given.rounds} rounds")
     missed = [row for row in rows if row.records and row.ratio < LEAST]
     lines = [f"missed: {row.mlflow}: {row.ratio:.3f} of the speed without tracking, wanted {LEAST}" for row in missed]
     console.print("\n".join(lines) or "all targets are met")
-    if given.json is not None:
-        machine = {"cpus": os.cpu_count(), "load_average": os.getloadavg()[0]}
-        write_rows(given.json, [row._asdict() | machine for row in rows])
+    return [row._asdict() | here for row in rows]
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code(run, sys.argv[1:]))
+    main(run, Arguments(), __doc__)

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from benchmarks.timing import alternate, write_rows
+from benchmarks.harness import alternate, write_rows
 
 
 def test_rivals_take_turns_and_every_other_round_goes_backwards():

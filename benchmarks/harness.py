@@ -1,0 +1,96 @@
+"""What all benchmarks share: rivals timed side by side in alternation, tables, and rows written as JSON."""
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn, TypeAlias, TypeVar
+
+from rich.table import Table
+
+from services.cli.arguments import exit_code, parse
+from services.cli.progress import console
+
+Row: TypeAlias = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class BenchmarkArguments:
+    """Arguments of every benchmark."""
+
+    json: Path | None = None
+    """Write the rows to this file."""
+
+
+A = TypeVar("A", bound=BenchmarkArguments)
+
+
+def main(run: Callable[[A], Sequence[Row] | Row], defaults: A, description: str | None) -> NoReturn:
+    """Run a benchmark as a program: read its arguments, and write what it returns as JSON if that is asked for."""
+
+    def program(arguments: Sequence[str]) -> None:
+        given = parse(type(defaults), description or "", arguments, defaults)
+        rows = run(given)
+        if given.json is not None:
+            write_rows(given.json, rows)
+            console.print(f"rows: {given.json}")
+
+    sys.exit(exit_code(program, sys.argv[1:]))
+
+
+def alternate(
+    functions: Mapping[str, Callable[[], object]],
+    rounds: int,
+    prepare: Mapping[str, Callable[[], object]] | None = None,
+    clock: Callable[[], float] | None = None,
+) -> dict[str, list[float]]:
+    """Time rivals in alternation, so that whatever else the machine does meets all of them alike.
+
+    Args:
+        functions: the rivals by name, each without arguments.
+        rounds: how often each is called; every other round goes backwards, so that none always follows the same.
+        prepare: what is to be called before each call of the rival of that name, untimed.
+        clock: if not that of the wall.
+
+    Returns:
+        For each name the seconds of its calls, in order: take medians, and ratios of medians.
+    """
+    clock = clock or time.perf_counter
+    seconds: dict[str, list[float]] = {name: [] for name in functions}
+    for number in range(rounds):
+        order = list(functions) if number % 2 == 0 else list(functions)[::-1]
+        for name in order:
+            if prepare is not None and name in prepare:
+                prepare[name]()
+            start = clock()
+            functions[name]()
+            seconds[name].append(clock() - start)
+    return seconds
+
+
+def lay_out(title: str, rows: Sequence[Mapping[str, str]], words: int = 1, **options: Any) -> Table:
+    """Lay out rows, whose keys are the heads; the first columns, so many, hold words, and all others numbers."""
+    table = Table(title=title, **options)
+    for index, head in enumerate(rows[0]):
+        table.add_column(head, justify="left" if index < words else "right")
+    for row in rows:
+        table.add_row(*row.values())
+    return table
+
+
+def machine() -> dict[str, Any]:
+    """Return what a row tells of the machine."""
+    return {"cpus": os.cpu_count(), "load_average": os.getloadavg()[0]}
+
+
+def write_rows(path: Path, rows: Sequence[Row] | Row) -> None:
+    """Write rows to `path` as a JSON list, one row a line, or one row alone as an object."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if isinstance(rows, Mapping):
+        text = json.dumps(rows, indent=1, allow_nan=False)
+    else:
+        text = "[\n" + ",\n".join(f"  {json.dumps(row, allow_nan=False)}" for row in rows) + "\n]"
+    path.write_text(text + "\n")
