@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
+import torch
 from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 
@@ -40,44 +41,44 @@ class SubSkillUse(NamedTuple):
     best: Int64[np.ndarray, " steps"]
 
 
-@runtime_checkable
-class Policy(Protocol):
+class Policy(ABC):
     """A policy adapted to one task, acting in several episodes in lockstep.
 
     What it must remember between steps it returns as `memory`, one row an episode, and receives again at the next
-    step: the caller drops the rows of finished episodes.
+    step: the caller drops the rows of finished episodes. As it stands here it remembers nothing and has one sub-skill.
     """
 
     def start(self, episodes: int) -> Int64[np.ndarray, "episodes memory_dim"]:
         """Return the memory of episodes at their first step."""
-        ...
+        return np.zeros((episodes, 0), np.int64)
 
+    @abstractmethod
     def act(
         self, observations: Float32[np.ndarray, "episodes obs_dim"], memory: Int64[np.ndarray, "episodes memory_dim"]
     ) -> Decision:
         """Choose one action for each episode; a method without sub-skills reports sub-skill 0."""
-        ...
 
     def sub_skill_use(self, demonstration: Demonstration) -> SubSkillUse:
         """Return the sub-skills along a demonstration; a method without sub-skills reports sub-skill 0."""
-        ...
-
-
-class Memoryless:
-    """Base of policies whose choice depends on the state alone."""
-
-    def start(self, episodes: int) -> Int64[np.ndarray, "episodes 0"]:
-        """Return an empty memory."""
-        return np.zeros((episodes, 0), np.int64)
-
-
-class Flat(Memoryless):
-    """Base of memoryless policies without sub-skills."""
-
-    def sub_skill_use(self, demonstration: Demonstration) -> SubSkillUse:
-        """Return sub-skill 0 throughout."""
         zeros = np.zeros(len(demonstration), np.int64)
         return SubSkillUse(zeros, zeros)
+
+
+class NormalisedPolicy(Policy):
+    """Base of policies without sub-skills, whose action depends on the normalised observation alone."""
+
+    normalise: Normalisation
+
+    @abstractmethod
+    def actions(self, states: Float32[Tensor, "episodes obs_dim"]) -> Float32[Tensor, "episodes action_dim"]:
+        """Return the action in each normalised state."""
+
+    def act(
+        self, observations: Float32[np.ndarray, "episodes obs_dim"], memory: Int64[np.ndarray, "episodes 0"]
+    ) -> Decision:
+        """Choose one action for each episode."""
+        actions = self.actions(torch.from_numpy(self.normalise(observations)))
+        return Decision(actions.numpy(), np.zeros(len(observations), np.int64), memory)
 
 
 class FineTuning(NamedTuple):

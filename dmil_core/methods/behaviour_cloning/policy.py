@@ -4,28 +4,26 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32
+from torch import Tensor
 
 from dmil_core.demonstrations import Normalisation
 from dmil_core.losses import Steps, squared_errors
-from dmil_core.methods.base import Decision, FineTuning, Flat
+from dmil_core.methods.base import FineTuning, NormalisedPolicy
 from dmil_core.networks import Layer, Network, Parameters, descend, initialise, mlp
 from dmil_core.settings import NetworkConfig
 
 
 @dataclass(frozen=True)
-class NetworkPolicy(Flat):
+class NetworkPolicy(NormalisedPolicy):
     """One network acts: a = π(s)."""
 
     network: Network
     normalise: Normalisation
 
-    def act(
-        self, observations: Float32[np.ndarray, "episodes obs_dim"], memory: Int64[np.ndarray, "episodes 0"]
-    ) -> Decision:
-        """Choose one action for each episode."""
-        actions = mlp(self.network, torch.from_numpy(self.normalise(observations)))
-        return Decision(actions.numpy(), np.zeros(len(observations), np.int64), memory)
+    def actions(self, states: Float32[Tensor, "episodes obs_dim"]) -> Float32[Tensor, "episodes action_dim"]:
+        """Return the action in each normalised state."""
+        return mlp(self.network, states)
 
 
 def initial_network(config: NetworkConfig, obs_dim: int, action_dim: int, rng: np.random.Generator) -> Parameters:

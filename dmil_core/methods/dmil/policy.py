@@ -8,13 +8,13 @@ from jaxtyping import Float32, Int64
 
 from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.losses import Steps
-from dmil_core.methods.base import Decision, Memoryless, SubSkillUse
+from dmil_core.methods.base import Decision, Policy, SubSkillUse
 from dmil_core.methods.dmil import adaptation
 from dmil_core.methods.dmil.adaptation import Hierarchy
 
 
 @dataclass(frozen=True)
-class DmilPolicy(Memoryless):
+class DmilPolicy(Policy):
     """The most probable sub-skill acts: a = π_k(s), k = argmax π_h(s)."""
 
     hierarchy: Hierarchy

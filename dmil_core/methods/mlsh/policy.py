@@ -8,13 +8,13 @@ from jaxtyping import Float32, Int64
 
 from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.losses import Steps, bank_errors, sub_skill_labels
-from dmil_core.methods.base import Decision, SubSkillUse
+from dmil_core.methods.base import Decision, Policy, SubSkillUse
 from dmil_core.methods.mlsh.macro_steps import macro_steps
 from dmil_core.networks import Network, mlp, routed
 
 
 @dataclass(frozen=True)
-class MlshPolicy:
+class MlshPolicy(Policy):
     """The high level picks the most probable sub-skill every few steps; its mean acts: a = μ_z(s)."""
 
     high: Network

@@ -2,26 +2,23 @@
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32
+from torch import Tensor
 
 from dmil_core.demonstrations import Normalisation
 from dmil_core.losses import Steps
-from dmil_core.methods.base import Decision, Flat
+from dmil_core.methods.base import NormalisedPolicy
 
 
 @dataclass(frozen=True)
-class NearestNeighbourPolicy(Flat):
+class NearestNeighbourPolicy(NormalisedPolicy):
     """Does what was done in the nearest state of the support set, the first of equally near ones."""
 
     support: Steps
     normalise: Normalisation
 
-    def act(
-        self, observations: Float32[np.ndarray, "episodes obs_dim"], memory: Int64[np.ndarray, "episodes 0"]
-    ) -> Decision:
-        """Choose one action for each episode."""
-        states = torch.from_numpy(self.normalise(observations))
+    def actions(self, states: Float32[Tensor, "episodes obs_dim"]) -> Float32[Tensor, "episodes action_dim"]:
+        """Return the action in each normalised state."""
         nearest = torch.cdist(states, self.support.states, compute_mode="donot_use_mm_for_euclid_dist").argmin(1)
-        return Decision(self.support.actions[nearest].numpy(), np.zeros(len(observations), np.int64), memory)
+        return self.support.actions[nearest]

@@ -9,12 +9,12 @@ from jaxtyping import Float32, Int64
 
 from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.losses import Steps
-from dmil_core.methods.base import Decision, SubSkillUse
+from dmil_core.methods.base import Decision, Policy, SubSkillUse
 from dmil_core.methods.option_gail.option_model import OptionModel
 
 
 @dataclass(frozen=True)
-class OptionPolicy:
+class OptionPolicy(Policy):
     """The most probable option after the last one acts, by its mean: a = μ_o(s), o = argmax π_H(o | s, o').
 
     An episode's memory is its last option, K at the start.

@@ -16,7 +16,6 @@ from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import (
     Decision,
     FineTuning,
-    Flat,
     MetaLearner,
     OnlineMetaLearner,
     Policy,
@@ -166,7 +165,7 @@ def test_practice_is_a_pure_function_that_takes_its_steps(experiment: Experiment
     assert not np.array_equal(found[0][0].observations, found[0][1].observations)
 
 
-class Replay(Flat):
+class Replay(Policy):
     """Does what a demonstration did."""
 
     def __init__(self, demonstration: Demonstration) -> None:

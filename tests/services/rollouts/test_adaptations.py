@@ -7,7 +7,7 @@ import pytest
 
 from dmil_core.configs import DemonstrationConfig, EvaluationConfig, SuiteConfig
 from dmil_core.demonstrations import Demonstration
-from dmil_core.methods.base import Decision, Flat, SubSkillUse
+from dmil_core.methods.base import Decision, Policy
 from services.rollouts.adaptations import EpisodeOutcome, imitation_error, plan_adaptations
 from services.rollouts.episodes import collect_rollouts, demonstrate, rollout
 from services.suites.base import Environment, Expert
@@ -16,7 +16,7 @@ from services.suites.metaworld import MetaWorldSuite
 HORIZON = 150
 
 
-class ExpertPolicy:
+class ExpertPolicy(Policy):
     """An expert that acts as a policy does, and remembers all that it saw and how many steps an episode has had."""
 
     def __init__(self, expert: Expert) -> None:
@@ -30,9 +30,6 @@ class ExpertPolicy:
         self.seen |= {(int(e), int(s)): o.copy() for o, (e, s) in zip(observations, memory, strict=True)}
         actions = np.array([self.expert.get_action(observation.astype(np.float64)) for observation in observations])
         return Decision(actions.astype(np.float32), memory[:, 1] // 10 % 3, memory + np.array([0, 1]))
-
-    def sub_skill_use(self, demonstration: Demonstration) -> SubSkillUse:
-        raise NotImplementedError
 
     def episode(self, number: int) -> np.ndarray:
         return np.array([observation for (episode, _), observation in self.seen.items() if episode == number])
@@ -183,7 +180,7 @@ def test_episodes_are_spread_evenly_over_disjoint_support_sets(episodes: int, dr
             assert len(support) == len(set(support)) == shots * len(of_one)
 
 
-class Remembering(Flat):
+class Remembering(Policy):
     """Does in each step as many units as it has taken steps."""
 
     def start(self, episodes: int) -> np.ndarray:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
-from dmil_core.methods.base import Decision, Flat
+from dmil_core.methods.base import Decision, Policy
 from dmil_core.trajectories import Rollout
 from services.rollouts.adaptations import EpisodeOutcome
 from services.rollouts.episodes import demonstrate, rollout
@@ -17,7 +17,7 @@ SUITE = open_suite(SuiteConfig(train_tasks=("reach",), test_tasks=("reach",)))
 SEEDS, HORIZON = [3, 4], 7
 
 
-class Wandering(Flat):
+class Wandering(Policy):
     """Moves by what it sees, beyond what the environment lets it."""
 
     def act(self, observations: np.ndarray, memory: np.ndarray) -> Decision:
