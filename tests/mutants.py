@@ -26,6 +26,8 @@ SECONDS = 900
 FAULTS: dict[tuple[str, ...], dict[str, str]] = {
     ("dmil_core/losses.py", "dmil_core/test_losses.py"): {
         "errors.argmin(0)": "errors.argmax(0)",
+    },
+    ("dmil_core/methods/dmil/losses.py", "dmil_core/methods/dmil/test_losses.py"): {
         "(-2 * deviation**2)": "(-(deviation**2))",
         "mass * (weighted - probabilities * weighted.sum(-1, keepdim=True))": "mass * (weighted)",
         "within = trajectory[1:] == trajectory[:-1]": "within = trajectory[1:] >= 0",

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from torch.nn import functional
 
 from dmil_core.loss_gradients import LossGradient, loss_gradient
-from dmil_core.losses import OutputLoss, behaviour_cloning_loss, high_level_loss
+from dmil_core.losses import OutputLoss, behaviour_cloning_loss
 from dmil_core.methods.dmil.adaptation import Hierarchy
+from dmil_core.methods.dmil.losses import high_level_loss
 from dmil_core.networks import BLOCK, Layer, Network
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}

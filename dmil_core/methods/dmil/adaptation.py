@@ -9,17 +9,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dmil_core.loss_gradients import LossGradient, loss_gradient
-from dmil_core.losses import (
-    Steps,
-    Targets,
-    bank_errors,
-    behaviour_cloning_loss,
-    high_level_loss,
-    soft_labels,
-    squared_errors,
-    sub_skill_labels,
-)
+from dmil_core.losses import Steps, behaviour_cloning_loss, squared_errors
 from dmil_core.methods.dmil.config import DmilConfig
+from dmil_core.methods.dmil.losses import Targets, high_level_loss, targets_of
 from dmil_core.networks import Network, Parameters, bank, mlp, network, own_states, routed, stacked, without_graph
 
 
@@ -54,18 +46,6 @@ class InnerStep(NamedTuple):
     low: Mapping[int, LossGradient]
     """Of each sub-skill that was given any states."""
     adapted: Hierarchy
-
-
-def label(low: Sequence[Network], steps: Steps) -> Int[Tensor, " steps"]:
-    """Return for each step the sub-skill that explains its action best, the target of equation 3."""
-    return sub_skill_labels(bank_errors(low, steps))
-
-
-def targets_of(errors: Float[Tensor, "sub_skills steps"], config: DmilConfig, *, inner: bool) -> Targets:
-    """Return what the high level should predict; in the outer loop, the reference's labels are hard."""
-    if config.em == "hard" or (config.em == "reference_soft" and not inner):
-        return sub_skill_labels(errors)
-    return soft_labels(errors, config.posterior_deviation, transposed=config.em == "soft")
 
 
 def choose(high: Network, states: Float[Tensor, "steps obs_dim"]) -> Int[Tensor, " steps"]:

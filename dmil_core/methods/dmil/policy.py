@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float32, Int64
 
 from dmil_core.demonstrations import Demonstration, Normalisation
-from dmil_core.losses import Steps
+from dmil_core.losses import Steps, bank_errors, sub_skill_labels
 from dmil_core.methods.base import Decision, Policy, SubSkillUse
 from dmil_core.methods.dmil import adaptation
 from dmil_core.methods.dmil.adaptation import Hierarchy
@@ -31,4 +31,4 @@ class DmilPolicy(Policy):
         """Return the high level's choice and the argmin label (equation 3) at each step."""
         steps = Steps.of([demonstration], self.normalise)
         chosen = adaptation.choose(self.hierarchy.high, steps.states)
-        return SubSkillUse(chosen.numpy(), adaptation.label(self.hierarchy.low, steps).numpy())
+        return SubSkillUse(chosen.numpy(), sub_skill_labels(bank_errors(self.hierarchy.low, steps)).numpy())

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch.nn import functional
 
 from benchmarks.masked_twin import MaskedTwin
-from dmil_core.losses import Steps
+from dmil_core.losses import Steps, bank_errors, sub_skill_labels
 from dmil_core.methods.dmil.adaptation import (
     Hierarchy,
     InnerStep,
@@ -18,7 +18,6 @@ from dmil_core.methods.dmil.adaptation import (
     choose,
     high_level_gradient,
     inner_loop,
-    label,
     sub_skill_gradients,
 )
 from dmil_core.methods.dmil.config import DmilConfig
@@ -293,7 +292,7 @@ def test_labels_follow_the_sub_skills_of_their_step(make_parameters, make_steps,
 def test_label_and_choice_by_plain_loops(hierarchy, support, plain_mlp) -> None:
     steps = support[0]
     errors = torch.stack([(plain_mlp(own, steps.states) - steps.actions).norm(dim=-1) for own in hierarchy.low])
-    labels = label(hierarchy.low, steps)
+    labels = sub_skill_labels(bank_errors(hierarchy.low, steps))
     assert labels.tolist() == [int(column.argmin()) for column in errors.T]
     assert len(set(labels.tolist())) > 1
     logits = plain_mlp(hierarchy.high, steps.states)

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.distributions import Independent, Normal
 
-from dmil_core.losses import Steps
-from dmil_core.methods.dmil.adaptation import Hierarchy, adapt, choose, high_level_gradient, label, sub_skill_gradients
+from dmil_core.losses import Steps, bank_errors, sub_skill_labels
+from dmil_core.methods.dmil.adaptation import Hierarchy, adapt, choose, high_level_gradient, sub_skill_gradients
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.networks import Parameters, bank, mlp, network
 
@@ -62,7 +62,7 @@ def test_theorem_2_no_assignment_beats_the_label(make_parameters, make_steps, se
     """Equation 24 is linear in p(z|s): its maximum over the simplex is one-hot at the label."""
     parameters, steps = make_parameters(seed % 1000, SUB_SKILLS), make_steps(seed, [20])
     densities = log_likelihoods(parameters, steps, sigma).exp()
-    labels = label(bank(parameters, "low"), steps)
+    labels = sub_skill_labels(bank_errors(bank(parameters, "low"), steps))
     generator = torch.Generator().manual_seed(seed)
     anything = torch.rand(SUB_SKILLS, 20, generator=generator, dtype=torch.float64).pow(3)
     one_hot = torch.nn.functional.one_hot(labels, SUB_SKILLS).T
@@ -75,7 +75,7 @@ def test_theorem_2_no_assignment_beats_the_label(make_parameters, make_steps, se
 def test_theorem_2_cross_entropy_drives_the_mixture_to_its_maximum(leaves, steps, gradient_of) -> None:
     """Equation 21's use: log max − log mixture is never above the cross-entropy, and falls to zero with it."""
     high, low = Hierarchy.of(leaves)
-    sigma, labels = 0.7, label(low, steps)
+    sigma, labels = 0.7, sub_skill_labels(bank_errors(low, steps))
     maximum = log_likelihoods(leaves, steps, sigma).amax(0).mean()
     optimiser, gaps = torch.optim.Adam(itertools.chain(*high), lr=0.05), []
     for _ in range(600):
@@ -91,7 +91,7 @@ def test_theorem_2_cross_entropy_drives_the_mixture_to_its_maximum(leaves, steps
 def test_theorem_2_the_high_gradients_agree_as_the_sub_skills_get_certain(leaves, steps, gradient_of) -> None:
     """Equation 21 holds in the limit of small σ, where the responsibilities become the labels."""
     high, low = Hierarchy.of(leaves)
-    of_loss = high_level_gradient(high, steps, label(low, steps), CONFIG)
+    of_loss = high_level_gradient(high, steps, sub_skill_labels(bank_errors(low, steps)), CONFIG)
     descent = torch.cat([gradient.flatten() for gradient in itertools.chain(*gradient_of(of_loss))])
 
     def gap(sigma: float) -> float:
