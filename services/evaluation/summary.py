@@ -115,10 +115,7 @@ class Summary(BaseModel):
 def cells(episodes: Sequence[EpisodeResult], best_score: int, method: MethodConfig) -> list[Cell]:
     """Return one cell for each split and size of support set, with Wilson intervals.
 
-    Args:
-        episodes: all rows.
-        best_score: of an episode in which all is done; where it is more than 1, scores are given too.
-        method: its settings, by which the paper's figures differ.
+    Where the score of an episode in which all is done is more than 1, scores are given too.
     """
     key = attrgetter("suite", "split", "shots")
     found = []

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.ticker import LogLocator, NullLocator
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dmil_core.configs import EvaluationConfig
@@ -20,7 +19,15 @@ from services.evaluation.evaluator import Evaluator
 from services.evaluation.results import EpisodeResult, ImitationResult, read_rows, write_rows
 from services.experiments.experiment import Experiment
 from services.experiments.finished_run import FinishedRun
-from services.reporting.drawing import Picture, colour_of, drawn, legend_of_markers, marker_of, panels
+from services.reporting.drawing import (
+    Picture,
+    colour_of,
+    drawn,
+    legend_of_markers,
+    marker_of,
+    panels,
+    scale_by_logarithms,
+)
 from services.reporting.lineup import MOST_TASKS, policy_after
 from services.reporting.page import DataTable, Part, Prose, Section
 from services.storage.files import read_file, write_file
@@ -257,24 +264,18 @@ def _draw(found: Sequence[Point]) -> Picture:
             style = {"color": colour_of(place), "marker": marker_of(place), "markersize": 4, "label": f"{size}-shot"}
             rates, reach = [point.success.mean for point in own], np.transpose([point.success.reach for point in own])
             success.errorbar(at, rates, yerr=reach, elinewidth=0.8, capsize=2, **style)
-            held_out.plot(at, [_or_nan(point.held_out_error) for point in own], **style)
-            support.plot(at, [_or_nan(point.support_error) for point in own], **style)
+            held_out.plot(at, np.array([point.held_out_error for point in own], float), **style)
+            support.plot(at, np.array([point.support_error for point in own], float), **style)
         success.set(title="success", ylabel="success rate", ylim=(-0.02, 1.02))
         for axis, title in ((held_out, "loss on held-out demonstrations"), (support, "loss on the support set")):
-            axis.set(title=title, ylabel="squared error of actions", yscale="log")
-            axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axis.yaxis.set_major_formatter("{x:g}")
-            axis.yaxis.set_minor_locator(NullLocator())
+            axis.set(title=title, ylabel="squared error of actions")
+            scale_by_logarithms(axis)
         for axis in axes:
             axis.set_xticks(range(len(steps)), map(str, steps))
             axis.set_xlabel("fine-tuning steps, not to scale")
         legend_of_markers(figure, [f"{size}-shot" for size in sizes], "solid")
         told = "; ".join(f"{size}-shot {_course(found, size)}" for size in sizes)
         return drawn(figure, "Success and loss over fine-tuning steps", f"Bars are 95% Wilson intervals. {told}.")
-
-
-def _or_nan(error: float | None) -> float:
-    return np.nan if error is None else error
 
 
 def _course(found: Sequence[Point], shots: int) -> str:

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator
 
-from services.reporting.drawing import DASHES, Picture, colour_of, drawn, panels
+from services.reporting.drawing import DASHES, Picture, colour_of, drawn, panels, scale_by_logarithms
 
 Metrics = Sequence[Sequence[Mapping[str, float]]]
 """Of each seed: the metrics of each iteration, under ``iteration`` its number."""
@@ -65,14 +65,7 @@ def _in_means(values: Float[np.ndarray, "seeds iterations"]) -> Float[np.ndarray
 def curves(title: str, rows: Mapping[str, Metrics], names: Mapping[str, str], *, rate: bool = False) -> Picture | None:
     """Draw a panel for each metric that some row has, with a line for each of these rows.
 
-    Args:
-        title: of the picture.
-        rows: the metrics of each, in the order of their colours.
-        names: of the metrics, by the words above their panels.
-        rate: from 0 to 1.
-
-    Returns:
-        Nothing, if no row has more than one point of any.
+    The names of the metrics are by the words above their panels; nothing is drawn if no row has two points of any.
     """
     found = {words: {row: curve_of(metrics, name) for row, metrics in rows.items()} for words, name in names.items()}
     drawable = {
@@ -97,10 +90,7 @@ def curves(title: str, rows: Mapping[str, Metrics], names: Mapping[str, str], *,
             if rate:
                 axis.set_ylim(-0.02, 1.02)
             elif 0 < 10 * low < high:
-                axis.set_yscale("log")
-                axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-                axis.yaxis.set_major_formatter("{x:g}")
-                axis.yaxis.set_minor_locator(NullLocator())
+                scale_by_logarithms(axis)
         for axis in axes[len(drawable) :]:
             axis.remove()
         figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=4, fontsize="small")

@@ -117,11 +117,7 @@ def training_curves(finished: FinishedRun) -> Section:
 
 
 def draw_metrics(metrics: Metrics) -> list[Picture]:
-    """Return the pictures of what was measured in each iteration; one in which nothing would be is left out.
-
-    Args:
-        metrics: of each iteration, under ``iteration`` its number.
-    """
+    """Return the pictures of what was measured in each iteration; one in which nothing would be is left out."""
     names = [name for name in dict.fromkeys(name for row in metrics for name in row) if not _is_unshown(name)]
     known = {name for panels_ in PICTURES.values() for panel in panels_ for name in _held(panel, names)}
     others = [Panel(_words(name), "", (name,)) for name in names if name not in known]
@@ -202,13 +198,7 @@ def _draw_shares(axis: Axes, curves: Mapping[str, Curve]) -> None:
 def draw_success(
     evaluations: Mapping[int, Sequence[EpisodeResult]], method: MethodConfig, best_score: int
 ) -> list[Picture]:
-    """Return how success, and the score where there is one, went over the iterations.
-
-    Args:
-        evaluations: the rows of each, by iteration.
-        method: settings of the run's.
-        best_score: of an episode in which all is done.
-    """
+    """Return how success, and the score where there is one, went over the iterations."""
     found = {iteration: cells(evaluations[iteration], best_score, method) for iteration in sorted(evaluations)}
     rates: Lines = defaultdict(list)
     scores: Lines = defaultdict(list)

@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullLocator
 
 from services.cli.colours import COLOURS, colour_of
 
@@ -79,18 +80,19 @@ def legend_of_markers(figure: Figure, names: Sequence[str], linestyle: Any = "no
     figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 6), frameon=False)
 
 
+def scale_by_logarithms(axis: Axes) -> None:
+    """Scale an axis upwards by logarithms, with plain numbers beside it."""
+    axis.set_yscale("log")
+    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_locator(NullLocator())
+
+
 @contextmanager
 def panels(
     rows: int = 1, columns: int = 1, *, width: float = 7.0, height: float = 3.0
 ) -> Iterator[tuple[Figure, list[Axes]]]:
-    """Give a figure with a grid of axes, and forget it at the end.
-
-    Args:
-        rows: of the grid.
-        columns: of the grid.
-        width: of the whole figure, in inches of 72 points.
-        height: of the whole figure.
-    """
+    """Give a figure with a grid of axes, `width` by `height` inches of 72 points in all, and forget it at the end."""
     with pyplot.rc_context(STYLE):
         figure, axes = pyplot.subplots(rows, columns, figsize=(width, height), layout="constrained", squeeze=False)
         try:
@@ -100,13 +102,7 @@ def panels(
 
 
 def drawn(figure: Figure, title: str, description: str) -> Picture:
-    """Return a figure as inline SVG that has a size, a text alternative, and ids that no other picture has.
-
-    Args:
-        figure: from `panels`.
-        title: of the picture, a few words.
-        description: what it shows, in a sentence or two, with its main figures.
-    """
+    """Return a figure as inline SVG that has a size, a text alternative, and ids that no other picture has."""
     text = StringIO()
     figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     svg = text.getvalue()

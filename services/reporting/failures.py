@@ -150,13 +150,7 @@ def _table_row(replayed: ReplayedEpisode, measure: Measure | None) -> list[str |
 
 
 def draw_episodes(replayed: Sequence[ReplayedEpisode], measure: Measure, best_score: int) -> Picture:
-    """Draw how far episodes of one task have come at every step: a line each, failures told apart by more than colour.
-
-    Args:
-        replayed: the episodes.
-        measure: of their task.
-        best_score: of an episode in which all is done.
-    """
+    """Draw how far episodes of one task have come at every step: a line each, failed ones crossed."""
     row, scored = replayed[0].row, measure.name == "score"
     kinds = {success: [one for one in replayed if one.rollout.success is success] for success in (True, False)}
     with panels(width=7.5, height=3.1) as (figure, (axis,)):

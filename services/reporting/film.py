@@ -70,12 +70,7 @@ def video_settings(view: str | View, steps: int, form: Form) -> VideoSettings:
 
 
 def compose(sides: Sequence[Side], rate: int) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    """Yield the pictures of a film, of even height and width; a side that is at its end waits for the other.
-
-    Args:
-        sides: one or more, with pictures of one size.
-        rate: pictures a second, by which the end is held.
-    """
+    """Yield the pictures of a film, of even height and width; a side that is at its end waits for the other."""
     length = max(len(side.frames) for side in sides)
     for time in range(length):
         panels = [_panel(side, time) for side in sides]

@@ -57,14 +57,12 @@ class Lineup:
 def line_up(runs: Mapping[str, FinishedRun], tasks: Sequence[str] | None = None) -> Lineup:
     """Put runs side by side on some tasks.
 
-    Args:
-        runs: at least one, by its label.
-        tasks: of their kind of robot, the runs' own or others; the first run's meta-testing tasks, at most
-            `MOST_TASKS`, if none are named.
+    The tasks are of their kind of robot, the runs' own or others; the first run's meta-testing tasks, at most
+    `MOST_TASKS`, if none are named.
 
     Raises:
-        UserError: if the runs are of different robots, or their demonstrations made or held out otherwise.
-        UserError: for a task that there is not.
+        UserError: if the runs are of different robots, or their demonstrations made or held out otherwise, or for a
+            task that there is not.
     """
     (first, run), *others = runs.items()
     for label, other in others:
@@ -73,16 +71,11 @@ def line_up(runs: Mapping[str, FinishedRun], tasks: Sequence[str] | None = None)
     if set(wanted) <= {task for _, task in run.experiment.tasks}:
         experiment, data = run.experiment, run.demonstrations
     else:
-        experiment = _on_tasks(run, wanted)
+        suite = run.config.suite.model_copy(update={"test_tasks": wanted})
+        experiment = Experiment(run.config.model_copy(update={"suite": suite}), run.experiment.store)
         data = experiment.collect(LocalRunner(experiment.suite))
     held_out = experiment.held_out_sets(data)
     return Lineup(runs, experiment, {task: held_out[task] for task in wanted})
-
-
-def _on_tasks(run: FinishedRun, tasks: Sequence[str]) -> Experiment:
-    """Return a run's experiment with other meta-testing tasks, as `services.evaluate` has it."""
-    suite = run.config.suite.model_copy(update={"test_tasks": tuple(tasks)})
-    return Experiment(run.config.model_copy(update={"suite": suite}), run.experiment.store)
 
 
 def _check_alike(first: str, run: FinishedRun, label: str, other: FinishedRun) -> None:
@@ -106,13 +99,7 @@ def has_sub_skills(run: FinishedRun) -> bool:
 
 
 def policy_after(run: FinishedRun, support: Sequence[Demonstration], steps: int) -> Policy:
-    """Return a run's policy for a support set after some fine-tuning steps.
-
-    Args:
-        run: whose newest checkpoint is adapted.
-        support: demonstrations of one task.
-        steps: of fine-tuning.
-    """
+    """Return a run's policy for a support set after some fine-tuning steps of its newest checkpoint."""
     method = run.checkpoint.method(run.experiment.suite.action_dim)
     parameters = {name: torch.from_numpy(array) for name, array in run.checkpoint.parameters.items()}
     return method.adapt(parameters, support, FineTuning(steps, run.config.evaluation.learning_rate))

@@ -74,13 +74,7 @@ class Section:
 
 
 def write_page(path: Path, title: str, lead: Sequence[Part], sections: Sequence[Section]) -> None:
-    """Write a page.
-
-    Args:
-        path: of the file.
-        title: of the page.
-        lead: what stands above all sections.
-        sections: in their order, with different titles; those without parts are left out.
+    """Write a page, the lead above all sections; those without parts are left out, and titles differ.
 
     Raises:
         DiskFullError: for want of space; the file is then what it was.

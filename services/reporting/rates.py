@@ -17,12 +17,7 @@ INCHES_A_TASK = 0.22
 
 
 def estimates(episodes: Sequence[EpisodeResult], *, scores: bool) -> dict[tuple[Split, int, str], Mean]:
-    """Return the success rate, with Wilson's interval, by split, shots and task.
-
-    Args:
-        episodes: all rows.
-        scores: return the mean score, with Student's interval, instead.
-    """
+    """Return the success rate, with Wilson's interval, by split, shots and task; of scores the mean with Student's."""
     groups: dict[tuple[Split, int, str], list[EpisodeResult]] = defaultdict(list)
     for row in episodes:
         groups[row.split, row.shots, row.task].append(row)

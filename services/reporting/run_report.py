@@ -89,13 +89,7 @@ def write_run_page(
     sections: Sequence[Writing] = AT_THE_END,
     tell: Callable[[], None] = lambda: None,
 ) -> None:
-    """Write the page of a run.
-
-    Args:
-        finished: the run.
-        path: of the file.
-        sections: of the page.
-        tell: is called after each of `sections`.
+    """Write the page of a run; `tell` is called after each of its sections.
 
     Raises:
         UserError: for a file of the run that is missing or damaged.

@@ -22,13 +22,6 @@ def write_comparison(
 ) -> None:
     """Write the page.
 
-    Args:
-        path: of the file.
-        title: of the page.
-        lead: paragraphs at its top.
-        comparison: what is put side by side.
-        commands: how all of it is had again.
-
     Raises:
         UserError: if a row has not as many episodes of each task and seed.
         DiskFullError: for want of space.

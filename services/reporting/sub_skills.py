@@ -16,11 +16,6 @@ DRAWN = 3
 def sub_skill_sections(lineup: Lineup, shots: int = 1, rollouts: int = 3) -> list[Section]:
     """Return a section for each task, with all runs whose methods have sub-skills; none if there is no such run.
 
-    Args:
-        lineup: the runs and tasks.
-        shots: demonstrations to adapt to; one, as in the paper.
-        rollouts: episodes to run for each run, before adaptation and after.
-
     Raises:
         UserError: if no demonstration is left to look at.
     """
@@ -29,9 +24,8 @@ def sub_skill_sections(lineup: Lineup, shots: int = 1, rollouts: int = 3) -> lis
     found = []
     with Bar("looking at sub-skills", len(lineup.held_out)) as bar:
         for task in lineup.held_out:
-            found.append(
-                Section(f"Sub-skills on {task}", _parts(task, shots, choices_on(lineup, task, shots, rollouts)))
-            )
+            shown = choices_on(lineup, task, shots, rollouts)
+            found.append(Section(f"Sub-skills on {task}", _parts(task, shots, shown)))
             bar.advance(1, task)
     return found
 

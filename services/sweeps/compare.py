@@ -81,11 +81,6 @@ def _of_runs(given: Arguments) -> Path:
 def write_sweep_page(tables: Tables, comparison: Comparison, path: Path) -> None:
     """Write the page of a sweep.
 
-    Args:
-        tables: what is shown of it elsewhere.
-        comparison: of its rows.
-        path: of the page.
-
     Raises:
         DiskFullError: for want of space.
     """
@@ -102,9 +97,7 @@ def write_sweep_page(tables: Tables, comparison: Comparison, path: Path) -> None
 def runs_compared(runs: Sequence[FinishedRun], baseline: str | None = None) -> Comparison:
     """Return finished runs as they are put side by side.
 
-    Args:
-        runs: two or more, of one suite.
-        baseline: a row or a run; that of the first run if none is named.
+    The baseline is a row or a run: that of the first run if none is named.
 
     Raises:
         UserError: for runs of different suites, the same run twice, or a baseline that is none of them.

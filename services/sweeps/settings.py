@@ -190,11 +190,7 @@ class PlannedTrial(Settings):
 
 
 def planned(sweep: Sweep, preset: Preset) -> list[PlannedTrial]:
-    """Return the trials of a sweep.
-
-    Args:
-        sweep: as it is at this preset.
-        preset: that its trials begin with.
+    """Return the trials of a sweep, which is as it is at this preset.
 
     Raises:
         UserError: for a suite or for settings that there are not; names where these come from.

@@ -54,12 +54,7 @@ class Tables(BaseModel):
 
 
 def comparison_of(sweep: SweepFolder, baseline: str | None = None) -> Comparison:
-    """Return a sweep's rows as they are put side by side.
-
-    Args:
-        sweep: whose trials they are of.
-        baseline: in place of the sweep's own.
-    """
+    """Return a sweep's rows as they are put side by side, with `baseline` in place of the sweep's own."""
     settings = sweep.record.sweep
     named = baseline or settings.baseline or settings.row_names[0]
     comparison = Comparison(
