@@ -49,12 +49,10 @@ class Arguments:
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     path: Path | None = peek(arguments, checkpoint=Path).checkpoint
-    if path is None:
-        path = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, EvaluationConfig())).checkpoint
-    checkpoint = (
-        Checkpoints(path / "checkpoints", kept=0).newest() if (path / "checkpoints").is_dir() else Checkpoint(path)
-    )
-    given = parse(Arguments, __doc__ or "", arguments, Arguments(path, checkpoint.manifest.config.evaluation))
+    checkpoint = None if path is None else _opened(path)
+    evaluation = EvaluationConfig() if checkpoint is None else checkpoint.manifest.config.evaluation
+    given = parse(Arguments, __doc__ or "", arguments, Arguments(path or tyro.MISSING, evaluation))
+    assert checkpoint is not None, "without --checkpoint there is nothing that parses"
     config = with_evaluation(checkpoint.manifest.config, given.evaluation)
     if given.tasks is not None:
         if given.promote:
@@ -78,6 +76,11 @@ def run(arguments: Sequence[str]) -> None:
     if contest is not None:
         for line in contest.settle(evaluation, given.output):
             console.print(line, markup=False, soft_wrap=True)
+
+
+def _opened(path: Path) -> Checkpoint:
+    checkpoints = path / "checkpoints"
+    return Checkpoints(checkpoints, kept=0).newest() if checkpoints.is_dir() else Checkpoint(path)
 
 
 if __name__ == "__main__":

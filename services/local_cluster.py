@@ -151,9 +151,7 @@ def _start(settings: Arguments) -> None:
     environment = {**os.environ, **OURS, "RAY_AUTH_TOKEN_PATH": str(token), "MLFLOW_TRACKING_URI": mlflow}
     environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{environment.get('PATH', '')}"
     environment.pop("RAY_ADDRESS", None)
-    temporary = Path(
-        tempfile.mkdtemp(prefix="dmil-")
-    )  # short: Ray's sockets lie in it, with paths of 107 bytes at most
+    temporary = Path(tempfile.mkdtemp(prefix="dmil-"))  # short: paths of Ray's sockets have 107 bytes at most
     started: list[Started] = []
     try:
         for server in _servers(settings, temporary, dashboard, mlflow):

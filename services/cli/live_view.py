@@ -1,6 +1,7 @@
 """What a program shows of the phase that it is in: as rows of a small screen, or in one line of words."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import timedelta
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -212,7 +213,5 @@ def _short(value: float) -> str:
     return f"{value:.3f}" if 0.001 <= abs(value) < 100 or not value else f"{value:.3g}"
 
 
-def _clock(seconds: float) -> str:
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{seconds:02d}"
+def _clock(seconds: float) -> timedelta:
+    return timedelta(seconds=round(seconds))

@@ -3,13 +3,13 @@
 import logging
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import TracebackType
 
 from rich.console import Console
 from rich.live import Live
+from rich.progress import Progress
 
 from services.cli.live_view import Pace, Screen, Status
 
@@ -17,7 +17,7 @@ LINE_SECONDS = 5.0
 REFRESHES = 2
 """Of the screen in a second."""
 LATELY_SECONDS = 30.0
-"""The time over which it is told how fast things go."""
+"""The time that the speed is the mean of."""
 
 
 class Output(Console):
@@ -77,34 +77,31 @@ class Bar:
             unit: what is counted, where its rate is of interest.
             status: returns what else to show; it is called from another thread.
         """
-        self._name, self._total, self._done, self._unit, self._text = name, total, done, unit, ""
+        self._name, self._unit, self._text = name, unit, ""
         self._status = status or (lambda: Status(at=self._text))
-        self._started, self._line_at, self._told = time.monotonic(), 0.0, -1
-        self._seen = deque([(self._started, done)])
+        self._line_at, self._line_done = 0.0, -1
+        self._progress = Progress(console=console, speed_estimate_period=LATELY_SECONDS)  # never started: it counts
+        self._progress.add_task(name, total=total, completed=done)
+        (self._task,) = self._progress.tasks
         self._live: Live | None = None
 
     def advance(self, steps: int, text: str = "") -> None:
         """Count `steps` more, and show `text` beside if there is no status."""
-        self._done += steps
+        self._progress.advance(self._task.id, steps)
         self._text = text
-        if self._live is None and (time.monotonic() - self._line_at >= LINE_SECONDS or self._done == self._total):
+        if self._live is None and (time.monotonic() - self._line_at >= LINE_SECONDS or self._task.finished):
             self._line()
 
     def _pace(self) -> Pace:
-        now = time.monotonic()
-        self._seen.append((now, self._done))
-        while len(self._seen) > 2 and now - self._seen[1][0] > LATELY_SECONDS:
-            self._seen.popleft()
-        before, done = self._seen[0]
-        rate = (self._done - done) / (now - before) if now > before else 0.0
-        return Pace(self._done, self._total, now - self._started, rate, self._unit)
+        task = self._task
+        return Pace(int(task.completed), int(task.total or 0), task.elapsed or 0.0, task.speed or 0.0, self._unit)
 
     def _screen(self) -> Screen:
         return Screen(self._name, self._pace(), self._status())
 
     def _line(self) -> None:
-        self._line_at, self._told = time.monotonic(), self._done
         pace = self._pace()
+        self._line_at, self._line_done = time.monotonic(), pace.done
         parts = [f"{self._name} {pace.done}/{pace.total}, {pace.line}", self._status().line]
         console.print("; ".join(filter(None, parts)), markup=False)
 
@@ -124,7 +121,7 @@ class Bar:
         if self._live is not None:
             self._live.stop()
             self._live = None
-        if self._told != self._done:
+        if self._line_done != self._task.completed:
             self._line()
 
 

@@ -252,11 +252,6 @@ class Checkpoints:
         self._prune(needed)
         return path
 
-    def _best(self) -> Path | None:
-        """Return the checkpoint with the least loss, of those that are not damaged."""
-        scored = {path: loss for path, loss in self._sound().items() if loss is not None and math.isfinite(loss)}
-        return min(scored, key=lambda path: scored[path]) if scored else None
-
     def _sound(self) -> dict[Path, float | None]:
         """Return the loss of each checkpoint, oldest first, without those that a look at their files finds damaged."""
         found: dict[Path, float | None] = {}
@@ -269,7 +264,9 @@ class Checkpoints:
 
     def _prune(self, needed: Collection[Path]) -> None:
         """Remove what is older than the newest `kept` whole checkpoints, damaged ones too, but not the best."""
-        whole, best = list(self._sound()), self._best()
+        losses = self._sound()
+        scored = {path: loss for path, loss in losses.items() if loss is not None and math.isfinite(loss)}
+        whole, best = list(losses), min(scored, key=lambda path: scored[path], default=None)
         for path in self.all() if len(whole) > self.kept else []:
             if path < whole[-self.kept] and path != best and path not in needed and not path.is_symlink():
                 shutil.rmtree(path)

@@ -58,19 +58,21 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _flush(delivery: Delivery, folder: Path, uri: str) -> None:
-    before = delivery.delivered
-    waiting = len(delivery.waiting())
+    before, waiting = delivery.identity.delivered, len(delivery.waiting())
     try:
         delivery.deliver()
     except (RunError, UserError):
         raise
     except Exception as error:  # noqa: BLE001  MLflow and what is below it raise many kinds
         raise RunError(
-            f"MLflow at {redacted(uri)} does not take records: {error_line(error)}; {delivery.delivered - before} of "
-            f"{waiting} were delivered, the others wait in {folder / 'tracking.jsonl'}; set MLFLOW_TRACKING_URI to "
-            "the MLflow that the run began with, and flush again"
+            f"MLflow at {redacted(uri)} does not take records: {error_line(error)}; "
+            f"{delivery.identity.delivered - before} of {waiting} were delivered, the others wait in "
+            f"{folder / 'tracking.jsonl'}; set MLFLOW_TRACKING_URI to the MLflow that the run began with, and "
+            "flush again"
         ) from None  # its text may hold secrets
-    console.print(f"delivered: {delivery.delivered - before} of {waiting} records, MLflow run {delivery.run_id}")
+    console.print(
+        f"delivered: {delivery.identity.delivered - before} of {waiting} records, MLflow run {delivery.identity.run_id}"
+    )
 
 
 def _report(folder: Path, uri: str) -> None:
@@ -92,8 +94,10 @@ def _report(folder: Path, uri: str) -> None:
 
 def _status(delivery: Delivery) -> None:
     waiting = len(delivery.waiting())
-    console.print(f"MLflow run: {delivery.run_id or 'not there yet'}")
-    console.print(f"records: {delivery.delivered + waiting}, delivered {delivery.delivered}, waiting {waiting}")
+    console.print(f"MLflow run: {delivery.identity.run_id or 'not there yet'}")
+    console.print(
+        f"records: {delivery.identity.delivered + waiting}, delivered {delivery.identity.delivered}, waiting {waiting}"
+    )
     if delivery.busy():
         console.print("a process, the run itself or a flush, is delivering them")
 

@@ -120,23 +120,9 @@ class Delivery:
         self._usual = self._limit = SLOW_SECONDS if uri.startswith("http") else OPENING_SECONDS
         self._asked: float | None = None
         self._was_slow = False
-        self._identity = Identity.of(folder)
+        self.identity = Identity.of(folder)
+        """Which MLflow run it is, and how many records that has taken, as far as is known."""
         self._offset = self._delivered_bytes()
-
-    @property
-    def run_id(self) -> str | None:
-        """The MLflow run's id, as far as it is known."""
-        return self._identity.run_id
-
-    @property
-    def experiment_id(self) -> str | None:
-        """The MLflow experiment's id, as far as it is known."""
-        return self._identity.experiment_id
-
-    @property
-    def delivered(self) -> int:
-        """How many records MLflow has taken."""
-        return self._identity.delivered
 
     @property
     def slow(self) -> bool:
@@ -150,7 +136,7 @@ class Delivery:
         Raises:
             UserError: if one is damaged.
         """
-        return list(read_spool(self._folder / "tracking.jsonl", line=self.delivered, offset=self._offset))
+        return list(read_spool(self._folder / "tracking.jsonl", line=self.identity.delivered, offset=self._offset))
 
     def busy(self) -> bool:
         """Tell whether another process is at it."""
@@ -200,11 +186,11 @@ class Delivery:
             raise RunError(
                 f"{self._folder}: another process, the run itself or a flush, delivers its records; wait for its end"
             ) from error
-        self._identity = Identity.of(self._folder)
+        self.identity = Identity.of(self._folder)
         self._offset = self._delivered_bytes()
 
     def _delivered_bytes(self) -> int:
-        path, count = self._folder / "tracking.jsonl", self.delivered
+        path, count = self._folder / "tracking.jsonl", self.identity.delivered
         ends = [line.end for line in islice(read_spool(path), count)]
         if len(ends) < count:
             raise UserError(
@@ -219,7 +205,7 @@ class Delivery:
 
             with self._asking():
                 self._client = MlflowClient(self._uri)
-        run_id = self.run_id
+        run_id = self.identity.run_id
         if run_id is None:
             experiment_id = self._experiment_in(self._client)
             run_id = self._run_in(self._client, experiment_id)
@@ -228,7 +214,7 @@ class Delivery:
 
     def _experiment_in(self, client: "MlflowClient") -> str:
         """Return the id of our experiment, which is made if it is not there."""
-        name = self._identity.experiment
+        name = self.identity.experiment
         with self._asking():
             found = client.get_experiment_by_name(name)
         if found:
@@ -238,7 +224,7 @@ class Delivery:
 
     def _run_in(self, client: "MlflowClient", experiment_id: str) -> str:
         """Return the id of our run: of one that was made before its id could be noted, or of a new one."""
-        identity = self._identity
+        identity = self.identity
         if (found := self._tagged(client, experiment_id, identity.tag)) is not None:
             return found
         tags = {RUN_TAG: identity.tag}
@@ -270,8 +256,8 @@ class Delivery:
             self._asked = None
 
     def _note(self, **changed: Any) -> None:
-        self._identity = self._identity.model_copy(update=changed)
-        write_file(self._folder / IDENTITY, self._identity.model_dump_json())
+        self.identity = self.identity.model_copy(update=changed)
+        write_file(self._folder / IDENTITY, self.identity.model_dump_json())
 
 
 def _problems(error: ValidationError) -> Iterator[str]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from services.storage.checkpoints import Checkpoint, CheckpointError
 from services.tracking.models import log_model
-from services.tracking.spool import Artifact, Ended, Line, Measured, Trained
+from services.tracking.spool import Artifact, Line, Measured, Trained
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -32,35 +32,32 @@ def next_batch(waiting: Sequence[Line]) -> Sequence[Line]:
 
 def send(client: "MlflowClient", run_id: str, folder: Path, batch: Sequence[Line]) -> None:
     """Have MLflow take records that go into one call."""
-    kind, value = batch[0].kind, batch[0].value
-    if kind == "begin":
-        client.update_run(run_id, status="RUNNING")
-    elif kind in {"metrics", "system"}:
-        _send_metrics(client, run_id, [line.value for line in batch])
-    elif kind == "parameters":
-        _send_parameters(client, run_id, value)
-    elif kind == "tags":
-        _send_tags(client, run_id, value)
-    elif kind == "inputs":
-        _send_inputs(client, run_id, value)
-    elif kind == "artifact":
-        _send_artifact(client, run_id, folder, value)
-    elif kind == "model":
-        _send_model(client, run_id, folder, value)
-    elif kind == "end":
-        _send_end(client, run_id, value)
+    from mlflow.entities import Dataset, DatasetInput, Metric
 
-
-def _send_metrics(client: "MlflowClient", run_id: str, values: list[Measured]) -> None:
-    from mlflow.entities import Metric
-
-    metrics = [
-        Metric(name, value, measured.time, measured.step)
-        for measured in values
-        for name, value in measured.values.items()
-    ]
-    for part in _parts(metrics, METRICS_PER_CALL):
-        client.log_batch(run_id, metrics=part, synchronous=True)
+    value = batch[0].value
+    match batch[0].kind:
+        case "begin":
+            client.update_run(run_id, status="RUNNING")
+        case "metrics" | "system":
+            measured = [line.value for line in batch]
+            metrics = [
+                Metric(name, value, one.time, one.step) for one in measured for name, value in one.values.items()
+            ]
+            for part in _parts(metrics, METRICS_PER_CALL):
+                client.log_batch(run_id, metrics=part, synchronous=True)
+        case "parameters":
+            _send_parameters(client, run_id, value)
+        case "tags":
+            _send_tags(client, run_id, value)
+        case "inputs":
+            inputs = [DatasetInput(Dataset(name, sha[:32], "local", name), []) for name, sha in value.items()]
+            client.log_inputs(run_id, datasets=inputs)
+        case "artifact":
+            _send_artifact(client, run_id, folder, value)
+        case "model":
+            _send_model(client, run_id, folder, value)
+        case "end":
+            client.set_terminated(run_id, value.status, value.time)
 
 
 def _send_parameters(client: "MlflowClient", run_id: str, values: dict[str, str]) -> None:
@@ -80,13 +77,6 @@ def _send_tags(client: "MlflowClient", run_id: str, values: dict[str, str]) -> N
         client.log_batch(run_id, tags=part, synchronous=True)
 
 
-def _send_inputs(client: "MlflowClient", run_id: str, values: dict[str, str]) -> None:
-    from mlflow.entities import Dataset, DatasetInput
-
-    inputs = [DatasetInput(Dataset(name, sha[:32], "local", name), []) for name, sha in values.items()]
-    client.log_inputs(run_id, datasets=inputs)
-
-
 def _send_artifact(client: "MlflowClient", run_id: str, folder: Path, value: Artifact) -> None:
     path = folder / value.path
     if not path.exists():
@@ -103,10 +93,6 @@ def _send_model(client: "MlflowClient", run_id: str, folder: Path, value: Traine
         _send_tags(client, run_id, {f"missing.{value.checkpoint}": str(error)[:5000]})
     else:
         log_model(client, run_id, checkpoint, value.example.model_dump())
-
-
-def _send_end(client: "MlflowClient", run_id: str, value: Ended) -> None:
-    client.set_terminated(run_id, value.status, value.time)
 
 
 def _parts(items: list[T], size: int) -> Iterator[list[T]]:

@@ -64,12 +64,12 @@ class Tracker:
     @property
     def run_id(self) -> str | None:
         """The MLflow run's id, as far as it is known."""
-        return self._delivery.run_id
+        return self._delivery.identity.run_id
 
     @property
     def address_lines(self) -> list[str]:
         """Lines that say where the MLflow run is, as far as it is known, and how to look at it."""
-        run_id, experiment_id, uri = self.run_id, self._delivery.experiment_id, tracking_uri()
+        run_id, experiment_id, uri = self.run_id, self._delivery.identity.experiment_id, tracking_uri()
         lines = [f"MLflow run: {run_id or 'not there yet'} at {self.uri}"]
         if (command := how_to_look(uri)) is not None:
             lines.append(f"to look at it: {command}")
@@ -80,7 +80,7 @@ class Tracker:
     @property
     def waiting(self) -> int:
         """How many records MLflow has not taken yet."""
-        return self._spool.count - self._delivery.delivered
+        return self._spool.count - self._delivery.identity.delivered
 
     def parameters(self, values: Mapping[str, Any]) -> None:
         """Record settings; MLflow keeps the first value of each, a resumed run's other value becomes a tag."""
@@ -171,29 +171,28 @@ class Tracker:
         return self._failed or self._delivery.slow
 
     def _work(self) -> None:
+        closing = False
         try:
-            while not self._delivered(closing=self._closing.wait(LINGER_SECONDS)):
-                pass
+            while not closing:
+                closing = self._closing.wait(LINGER_SECONDS)
+                self._deliver()
+                if self._failed and not closing:
+                    self._closing.wait(RETRY_SECONDS)
         finally:
             self._delivery.close()
 
-    def _delivered(self, *, closing: bool) -> bool:
-        """Deliver what there is, and return whether it is time to end."""
+    def _deliver(self) -> None:
         try:
             self._delivery.deliver()
         except Exception as error:  # noqa: BLE001  whatever MLflow raises, training goes on
-            self._failed = True
             if not self._complained:
-                self._complained = True
                 logger.warning(
                     f"MLflow at {self.uri} does not take records ({error_line(error)}); training goes on, "
                     f"records wait in {self._spool.path}"
                 )
-            if not closing:
-                self._closing.wait(RETRY_SECONDS)
-            return closing
-        self._failed = False
-        return closing
+            self._failed = self._complained = True
+        else:
+            self._failed = False
 
 
 def record_settings(tracker: Tracker, config: ExperimentConfig) -> None:

@@ -77,7 +77,7 @@ def test_who_takes_over_begins_where_the_other_ended(tmp_path: Path, mlflow_file
     one.close()
     other.deliver()
     other.close()
-    assert (other.run_id, other.delivered) == (one.run_id, 2)
+    assert (other.identity.run_id, other.identity.delivered) == (one.identity.run_id, 2)
 
 
 @pytest.mark.usefixtures("no_mlflow")
@@ -91,7 +91,7 @@ def test_what_is_delivered_together_is_noted_together(tmp_path: Path, mlflow_fil
     delivery = Delivery(tmp_path, mlflow_file)
     delivery.deliver()
     delivery.close()
-    assert (delivery.delivered, delivery.waiting()) == (len(records) - 1, [])
+    assert (delivery.identity.delivered, delivery.waiting()) == (len(records) - 1, [])
 
 
 @pytest.mark.parametrize("content", ["", "no JSON", "{}", '{"run_id": "x", "delivered": 1}'])
@@ -120,6 +120,6 @@ def test_an_artifact_that_is_gone_does_not_hold_up_the_others(tmp_path: Path, ml
     delivery = Delivery(tmp_path, mlflow_file)
     delivery.deliver()
     delivery.close()
-    run = MlflowClient(mlflow_file).get_run(str(delivery.run_id))
+    run = MlflowClient(mlflow_file).get_run(str(delivery.identity.run_id))
     assert run.info.status == "FINISHED"
     assert run.data.tags["missing.gone.md"] == "was gone before MLflow could be given it"
