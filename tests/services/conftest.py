@@ -26,6 +26,7 @@ from services.cli.progress import console_logging
 from services.demonstrations.store import DemoStore, TaskDemonstrations
 from services.distributed.ray_runner import open_runner
 from services.experiments.experiment import Experiment
+from services.experiments.finished_run import FinishedRun
 from services.storage.checkpoints import Checkpoint, Checkpoints
 
 PROJECT = Path(__file__).parents[2]
@@ -323,3 +324,12 @@ def complaint(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
         return "".join(capsys.readouterr())
 
     return say
+
+
+@pytest.fixture(scope="session")
+def finished(shared_run: Callable[..., Path]) -> FinishedRun:
+    """A run of four iterations on three tasks, evaluated on the way too: two episodes for each of 1 and 2 shots."""
+    schedule = ("--training.iterations", "4", "--training.checkpoint-every", "2", "--evaluation.every", "2")
+    return FinishedRun(
+        shared_run("tiny", *schedule, "--evaluation.shots", "1", "2", "--evaluation.fine-tuning-steps", "1")
+    )

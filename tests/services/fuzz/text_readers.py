@@ -109,8 +109,16 @@ class MetricsReader:
         for kind, record in map(json.loads, whole):
             if kind == "metrics":
                 row = found.setdefault(record["step"], {"iteration": record["step"]})
-                row.update({name: float(number) for name, number in record["values"].items()})
+                row.update({name: as_float(number) for name, number in record["values"].items()})
         return repr(value) == repr([found[step] for step in sorted(found)])
+
+
+def as_float(number: float) -> float:
+    """Return a number of JSON as the reader has it: an integer that is too large is infinite."""
+    try:
+        return float(number)
+    except OverflowError:
+        return math.copysign(math.inf, number)
 
 
 def lines(path: Path) -> list[bytes]:

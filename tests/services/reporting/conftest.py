@@ -125,12 +125,3 @@ def trained(planar_visits: Path) -> Callable[..., FinishedRun]:
         return FinishedRun(folder)
 
     return train
-
-
-@pytest.fixture(scope="session")
-def finished(shared_run: Callable[..., Path]) -> FinishedRun:
-    """A run of four iterations on three tasks, evaluated on the way too: two episodes for each of 1 and 2 shots."""
-    schedule = ("--training.iterations", "4", "--training.checkpoint-every", "2", "--evaluation.every", "2")
-    return FinishedRun(
-        shared_run("tiny", *schedule, "--evaluation.shots", "1", "2", "--evaluation.fine-tuning-steps", "1")
-    )
