@@ -81,7 +81,7 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
         "for path in reversed(paths)": "for path in paths",
     },
     ("services/storage/remote.py", "services/storage/test_remote.py"): {
-        "key=lambda file: file == seal": "key=lambda file: file != seal",
+        "key=lambda file: file == marker": "key=lambda file: file != marker",
         "if size > most:": "if size > 2 * most:",
     },
     ("services/tracking/spool.py", "services/tracking/test_spool.py"): {
@@ -92,7 +92,7 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
     },
     ("services/rollouts/episodes.py", "services/rollouts"): {
         'config.labels == "noisy"': 'config.labels != "noisy"',
-        "min(horizon, len(actions) + config.trailing_steps)": "len(actions) + config.trailing_steps",
+        "min(horizon, recorder.solved_at + 1 + config.trailing_steps)": "recorder.solved_at + 1 + config.trailing_steps",
     },
     ("services/rollouts/adaptations.py", "services/rollouts"): {
         "range(draw, evaluation.episodes, evaluation.support_draws)": "range(draw, evaluation.episodes)",
