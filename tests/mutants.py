@@ -92,7 +92,7 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
     },
     ("services/rollouts/episodes.py", "services/rollouts"): {
         'config.labels == "noisy"': 'config.labels != "noisy"',
-        "min(horizon, recorder.solved_at + 1 + config.trailing_steps)": "recorder.solved_at + 1 + config.trailing_steps",
+        "end = min(horizon, recorder.solved_at": "end = max(horizon, recorder.solved_at",
     },
     ("services/rollouts/adaptations.py", "services/rollouts"): {
         "range(draw, evaluation.episodes, evaluation.support_draws)": "range(draw, evaluation.episodes)",
