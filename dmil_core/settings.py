@@ -50,6 +50,11 @@ class NetworkConfig(MethodConfig):
         return [self.hidden_units] * self.hidden_layers
 
 
+QUICK_NETWORK = {"hidden_layers": 3, "hidden_units": 256, "output_scale": 0.07}
+SMOKE_NETWORK = {"hidden_layers": 2, "hidden_units": 32}
+"""Settings of a `NetworkConfig` in the presets quick and smoke."""
+
+
 class WindowConfig(MethodConfig):
     """Base of the settings of a method that draws {τ1}..{τ4} of Algorithm 1."""
 

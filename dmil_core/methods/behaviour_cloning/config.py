@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from dmil_core.settings import NetworkConfig, WindowConfig
+from dmil_core.settings import QUICK_NETWORK, SMOKE_NETWORK, NetworkConfig, WindowConfig
 
 
 class BehaviourCloningConfig(NetworkConfig, WindowConfig):
@@ -13,14 +13,6 @@ class BehaviourCloningConfig(NetworkConfig, WindowConfig):
     """The method."""
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        "quick": {
-            "method": {
-                "hidden_layers": 3,
-                "hidden_units": 256,
-                "output_scale": 0.07,
-                "trajectories": 4,
-                "window": 24,
-            }
-        },
-        "smoke": {"method": {"hidden_layers": 2, "hidden_units": 32, "trajectories": 2, "window": 24}},
+        "quick": {"method": {**QUICK_NETWORK, "trajectories": 4, "window": 24}},
+        "smoke": {"method": {**SMOKE_NETWORK, "trajectories": 2, "window": 24}},
     }

@@ -3,7 +3,16 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from dmil_core.settings import HierarchicalConfig, NetworkConfig, NotNegative, Positive, Size, WindowConfig
+from dmil_core.settings import (
+    QUICK_NETWORK,
+    SMOKE_NETWORK,
+    HierarchicalConfig,
+    NetworkConfig,
+    NotNegative,
+    Positive,
+    Size,
+    WindowConfig,
+)
 
 
 class DmilConfig(HierarchicalConfig, NetworkConfig, WindowConfig):
@@ -34,9 +43,7 @@ class DmilConfig(HierarchicalConfig, NetworkConfig, WindowConfig):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "quick": {
             "method": {
-                "hidden_layers": 3,
-                "hidden_units": 256,
-                "output_scale": 0.07,
+                **QUICK_NETWORK,
                 "inner_learning_rate": 5e-3,
                 "continuity_weight": 0.0,
                 "order": "first",
@@ -46,8 +53,7 @@ class DmilConfig(HierarchicalConfig, NetworkConfig, WindowConfig):
         },
         "smoke": {
             "method": {
-                "hidden_units": 32,
-                "hidden_layers": 2,
+                **SMOKE_NETWORK,
                 "inner_learning_rate": 1e-2,
                 "trajectories": 2,
                 "window": 24,

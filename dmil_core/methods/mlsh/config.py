@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 from dmil_core.settings import (
+    QUICK_NETWORK,
+    SMOKE_NETWORK,
     Count,
     HierarchicalConfig,
     NetworkConfig,
@@ -53,9 +55,7 @@ class MlshConfig(HierarchicalConfig, NetworkConfig):
         },
         "quick": {
             "method": {
-                "hidden_layers": 3,
-                "hidden_units": 256,
-                "output_scale": 0.07,
+                **QUICK_NETWORK,
                 "high_learning_rate": 1e-2,
                 "sub_skill_learning_rate": 3e-3,
                 "warm_up_updates": 60,
@@ -75,8 +75,7 @@ class MlshConfig(HierarchicalConfig, NetworkConfig):
         },
         "smoke": {
             "method": {
-                "hidden_layers": 2,
-                "hidden_units": 32,
+                **SMOKE_NETWORK,
                 "high_learning_rate": 1e-2,
                 "sub_skill_learning_rate": 1e-3,
                 "warm_up_updates": 10,

@@ -6,6 +6,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from dmil_core.settings import (
+    QUICK_NETWORK,
+    SMOKE_NETWORK,
     Count,
     HierarchicalConfig,
     NetworkConfig,
@@ -39,16 +41,14 @@ class OptionGailOfflineConfig(OptionConfig):
         "paper": {"evaluation": {"learning_rate": 3e-4}},
         "quick": {
             "method": {
-                "hidden_layers": 3,
-                "hidden_units": 256,
-                "output_scale": 0.07,
+                **QUICK_NETWORK,
                 "trajectories": 4,
                 "likelihood_iterations": 500,
             },
             "evaluation": {"learning_rate": 1e-3},
         },
         "smoke": {
-            "method": {"hidden_layers": 2, "hidden_units": 32, "trajectories": 2, "likelihood_iterations": 10},
+            "method": {**SMOKE_NETWORK, "trajectories": 2, "likelihood_iterations": 10},
             "evaluation": {"learning_rate": 1e-3},
         },
     }
@@ -99,9 +99,7 @@ class OptionGailConfig(OptionConfig):
         },
         "quick": {
             "method": {
-                "hidden_layers": 3,
-                "hidden_units": 256,
-                "output_scale": 0.07,
+                **QUICK_NETWORK,
                 "least_log_deviation": -2.0,
                 "trajectories": 4,
                 "likelihood_iterations": 30,
@@ -121,8 +119,7 @@ class OptionGailConfig(OptionConfig):
         },
         "smoke": {
             "method": {
-                "hidden_layers": 2,
-                "hidden_units": 32,
+                **SMOKE_NETWORK,
                 "trajectories": 2,
                 "likelihood_iterations": 1,
                 "offline_iterations": 2,

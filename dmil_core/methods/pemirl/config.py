@@ -5,7 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from dmil_core.settings import Count, NetworkConfig, NotNegative, Size
+from dmil_core.settings import QUICK_NETWORK, SMOKE_NETWORK, Count, NetworkConfig, NotNegative, Size
 
 
 class PemirlConfig(NetworkConfig):
@@ -39,18 +39,15 @@ class PemirlConfig(NetworkConfig):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "quick": {
             "method": {
-                "hidden_layers": 3,
-                "hidden_units": 256,
-                "output_scale": 0.07,
+                **QUICK_NETWORK,
                 "trajectories": 8,
                 "steps_per_trajectory": 32,
             },
         },
         "smoke": {
             "method": {
-                "hidden_layers": 2,
+                **SMOKE_NETWORK,
                 "reward_layers": 2,
-                "hidden_units": 32,
                 "trajectories": 4,
                 "contexts": 2,
                 "steps_per_trajectory": 24,

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from dmil_core.settings import NetworkConfig
+from dmil_core.settings import SMOKE_NETWORK, NetworkConfig
 
 
 class PerTaskConfig(NetworkConfig):
@@ -19,5 +19,5 @@ class PerTaskConfig(NetworkConfig):
             "training": {"iterations": 0},
             "evaluation": {"fine_tuning_steps": 1000, "learning_rate": 1e-3},
         },
-        "smoke": {"method": {"hidden_layers": 2, "hidden_units": 32}, "training": {"iterations": 0}},
+        "smoke": {"method": SMOKE_NETWORK, "training": {"iterations": 0}},
     }
