@@ -14,7 +14,7 @@ from dmil_core.demonstrations import Demonstration, DemonstrationError
 from services.cli.arguments import exit_code, parse
 from services.cli.composition import suite_settings
 from services.cli.progress import Bar, console
-from services.demonstrations.external import FORMS, Recording, misfits, read_recordings
+from services.demonstrations.external import FORMS, ExternalEpisode, misfits, read_episodes
 from services.suites.base import TaskSuite
 from services.suites.registry import open_suite
 
@@ -37,24 +37,24 @@ def run(arguments: Sequence[str]) -> None:
     suite = None if given.suite is None else open_suite(suite_settings(given.suite))
     form = given.data.partition(":")[0]
     place = given.data if form in FORMS else f"{SUFFIXES.get(Path(given.data).suffix, 'minari')}:{given.data}"
-    recordings = read_recordings(place)
-    console.print(_table(place, recordings, suite))
-    problems = [*_problems(recordings, suite)]
+    episodes = read_episodes(place)
+    console.print(_table(place, episodes, suite))
+    problems = [*_problems(episodes, suite)]
     for problem in problems:
         console.print(problem, markup=False)
     console.print(f"{len(problems)} things are wrong" if problems else "nothing is wrong with it")
 
 
-def _table(place: str, recordings: Sequence[Recording], suite: TaskSuite | None) -> Table:
-    shapes = {(one.observations.shape[1], one.actions.shape[1]) for one in recordings}
+def _table(place: str, episodes: Sequence[ExternalEpisode], suite: TaskSuite | None) -> Table:
+    shapes = {(one.observations.shape[1], one.actions.shape[1]) for one in episodes}
     numbers = " and ".join(f"{obs_dim} observed, {action_dim} done" for obs_dim, action_dim in sorted(shapes))
-    view = Table(title=f"{place}: {len(recordings)} episodes; numbers a step: {numbers}")
+    view = Table(title=f"{place}: {len(episodes)} episodes; numbers a step: {numbers}")
     replay = getattr(suite, "replay", None)
     columns = ["episode", "steps", "observations", "actions", "reward", "success"]
     for column in columns + ["replayed"] * (replay is not None):
         view.add_column(column, justify="left" if column == "replayed" else "right")
-    with Bar("reading", len(recordings)) as bar:
-        for index, one in enumerate(recordings):
+    with Bar("reading", len(episodes)) as bar:
+        for index, one in enumerate(episodes):
             row = [
                 str(index),
                 str(len(one.actions)),
@@ -72,22 +72,22 @@ def _range(values: np.ndarray) -> str:
     return f"{values.min():.3g} to {values.max():.3g}" if values.size else "none"
 
 
-def _replayed(recording: Recording, suite: TaskSuite) -> str:
+def _replayed(episode: ExternalEpisode, suite: TaskSuite) -> str:
     try:
-        return suite.replay(_demonstration(recording, 0, suite))  # type: ignore[attr-defined]
+        return suite.replay(_demonstration(episode, 0, suite))  # type: ignore[attr-defined]
     except DemonstrationError:
         return "not possible"
 
 
-def _demonstration(recording: Recording, index: int, suite: TaskSuite | None) -> Demonstration:
+def _demonstration(episode: ExternalEpisode, index: int, suite: TaskSuite | None) -> Demonstration:
     state_of = getattr(suite, "state_of", lambda observations: observations)
-    return Demonstration(f"{index:03d}", "recorded", state_of(recording.observations), recording.actions)
+    return Demonstration(f"{index:03d}", "recorded", state_of(episode.observations), episode.actions)
 
 
-def _problems(recordings: Sequence[Recording], suite: TaskSuite | None) -> Iterator[str]:
+def _problems(episodes: Sequence[ExternalEpisode], suite: TaskSuite | None) -> Iterator[str]:
     """Yield what keeps a data set from being learned from, and what looks like a mistake."""
     seen: dict[bytes, int] = {}
-    for index, one in enumerate(recordings):
+    for index, one in enumerate(episodes):
         try:
             demonstration = _demonstration(one, index, suite)
         except DemonstrationError as error:

@@ -32,7 +32,7 @@ class _Metadata(BaseModel):
     data_format: str = "hdf5"
 
 
-class Recording(NamedTuple):
+class ExternalEpisode(NamedTuple):
     """One episode, as recorded."""
 
     observations: Float32[np.ndarray, "steps obs_dim"]
@@ -66,7 +66,7 @@ def places_of(source: str) -> dict[str, str]:
     return places
 
 
-def read_recordings(place: str) -> list[Recording]:
+def read_episodes(place: str) -> list[ExternalEpisode]:
     """Read the episodes of a data set.
 
     Args:
@@ -77,7 +77,7 @@ def read_recordings(place: str) -> list[Recording]:
     """
     form, _, path = place.partition(":")
     if form == "npz":
-        return [Recording(one.observations, one.actions, None, None) for one in read_npz(Path(path), "recorded")]
+        return [ExternalEpisode(one.observations, one.actions, None, None) for one in read_npz(Path(path), "recorded")]
     try:
         return _read_minari(path) if form == "minari" else _read_hdf5(Path(path))
     except DemonstrationError as error:
@@ -97,10 +97,10 @@ def demonstrations(task: str, place: str, suite: TaskSuite, most: int) -> TaskDe
     """
     state_of = getattr(suite, "state_of", lambda observations: observations)
     found = []
-    for index, recording in enumerate(read_recordings(place)[:most]):
+    for index, episode in enumerate(read_episodes(place)[:most]):
         try:
-            observations = np.ascontiguousarray(state_of(recording.observations), np.float32)
-            demonstration = Demonstration(f"{index:03d}", task, observations, recording.actions)
+            observations = np.ascontiguousarray(state_of(episode.observations), np.float32)
+            demonstration = Demonstration(f"{index:03d}", task, observations, episode.actions)
             check_dimensions(demonstration, suite)
         except DemonstrationError as error:
             raise DemonstrationError(f"{place}: episode {index}: {error}") from error
@@ -125,7 +125,7 @@ def misfits(demonstration: Demonstration, suite: TaskSuite) -> Iterator[str]:
             yield f"{field}: got {got} numbers a step; {suite.name} wants {wanted}"
 
 
-def _read_minari(dataset_id: str) -> list[Recording]:
+def _read_minari(dataset_id: str) -> list[ExternalEpisode]:
     """Read a Minari data set without Minari, which would make the environment that the metadata name."""
     folder = inside(data_root(), dataset_id) / "data"
     if not folder.exists():
@@ -141,7 +141,7 @@ def _read_minari(dataset_id: str) -> list[Recording]:
         return [_episode(file, f"episode_{index}") for index in range(metadata.total_episodes)]
 
 
-def _episode(file: PlainFile, name: str) -> Recording:
+def _episode(file: PlainFile, name: str) -> ExternalEpisode:
     actions = file.array(f"{name}/actions", axes=2)
     observations = _observations(file, f"{name}/observations")
     if len(observations) not in (len(actions), len(actions) + 1):
@@ -149,7 +149,7 @@ def _episode(file: PlainFile, name: str) -> Recording:
             f"{name}: got {len(observations)} observations of {len(actions)} actions; wanted one more, or as many"
         )
     success = file.array(f"{name}/infos/success") if file.has(f"{name}/infos/success") else None
-    return Recording(
+    return ExternalEpisode(
         observations[: len(actions)],
         actions.astype(np.float32),
         float(file.array(f"{name}/rewards", axes=1).sum()),
@@ -164,7 +164,7 @@ def _observations(file: PlainFile, name: str) -> Float32[np.ndarray, "steps obs_
     return observations.reshape(len(observations), -1).astype(np.float32)
 
 
-def _read_hdf5(path: Path) -> list[Recording]:
+def _read_hdf5(path: Path) -> list[ExternalEpisode]:
     with open_plain(path) as file:
         observations, actions = (file.array(name, axes=2) for name in ("observations", "actions"))
         if len(observations) != len(actions):
@@ -183,7 +183,7 @@ def _read_hdf5(path: Path) -> list[Recording]:
     cuts = np.flatnonzero(ends) + 1  # what follows the last mark is no whole episode
     parts = [slice(start, end) for start, end in zip([0, *cuts[:-1].tolist()], cuts.tolist(), strict=True)]
     return [
-        Recording(
+        ExternalEpisode(
             observations[part].astype(np.float32),
             actions[part].astype(np.float32),
             None if rewards is None else float(rewards[part].sum()),

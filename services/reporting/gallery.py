@@ -49,12 +49,12 @@ class Arguments:
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     given = parse(Arguments, __doc__ or "", arguments, Arguments())
-    given.output.mkdir(parents=True, exist_ok=True)
     for name in given.suites:
         suite = open_suite(SuiteConfig(name=name))
         camera: str | View | None = getattr(suite, "camera", None)
         if camera is None:
             raise UserError(f"--suites: got {name}, which names no camera; wanted suites whose tasks can be drawn")
+        given.output.mkdir(parents=True, exist_ok=True)
         path = given.output / f"{name}.jpg"
         draw_gallery(suite, camera, given.seed, path, COLUMNS.get(name.partition("-")[0], 5))
         console.print(str(path))

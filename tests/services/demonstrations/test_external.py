@@ -13,7 +13,7 @@ from minari.data_collector import EpisodeBuffer
 
 from dmil_core.configs import SuiteConfig
 from dmil_core.demonstrations import DemonstrationError
-from services.demonstrations.external import demonstrations, places_of, read_recordings
+from services.demonstrations.external import demonstrations, places_of, read_episodes
 from services.suites.registry import open_suite
 
 LENGTHS = (4, 7, 5)
@@ -92,15 +92,13 @@ MAKERS: dict[str, Callable[[Path], str]] = {
 @pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
 def test_the_episodes_are_those_that_were_recorded(root: Path, make: Callable[[Path], str]):
     place = make(root)
-    found = read_recordings(place)
+    found = read_episodes(place)
     assert len(found) == len(EPISODES)
-    for recording, (observations, actions) in zip(found, EPISODES, strict=True):
-        assert np.array_equal(recording.actions, actions)
-        assert np.array_equal(recording.observations, observations)
-    assert {recording.reward for recording in found} == (
-        {None} if place.startswith("npz") else set(map(float, LENGTHS))
-    )
-    assert [recording.success for recording in found] == (
+    for episode, (observations, actions) in zip(found, EPISODES, strict=True):
+        assert np.array_equal(episode.actions, actions)
+        assert np.array_equal(episode.observations, observations)
+    assert {episode.reward for episode in found} == ({None} if place.startswith("npz") else set(map(float, LENGTHS)))
+    assert [episode.success for episode in found] == (
         [False, True, False] if place.startswith("minari") else [None] * 3
     )
     learned = demonstrations("slide", place, KITCHEN, most=2)
@@ -145,7 +143,7 @@ ODD = {
 def test_what_cannot_be_read_is_told_in_words(root: Path, make: Callable[[Path], str], said: str):
     place = make(root)
     with pytest.raises(DemonstrationError) as error:
-        read_recordings(place)
+        read_episodes(place)
     assert said in str(error.value)
     assert place.partition(":")[2] in str(error.value)
 
@@ -172,7 +170,7 @@ def test_what_a_minari_data_set_names_is_not_run(root: Path, entry_point: str):
     for without in ((), ("observation_space", "action_space")):
         content = json.loads(metadata.read_text()) | {"env_spec": json.dumps(spec)}
         metadata.write_text(json.dumps({key: value for key, value in content.items() if key not in without}))
-        assert len(read_recordings(place)) == len(EPISODES)
+        assert len(read_episodes(place)) == len(EPISODES)
     assert not (root / "made").exists()
 
 
@@ -184,4 +182,4 @@ def test_a_private_file_is_not_read_as_observations(root: Path):
         del file["episode_1/observations"]
         file.create_dataset("episode_1/observations", (8, 60), "u1", external=[(str(root / "secret"), 0, 480)])
     with pytest.raises(DemonstrationError, match="episode_1/observations: got no array of this file"):
-        read_recordings(place)
+        read_episodes(place)
