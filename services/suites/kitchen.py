@@ -98,8 +98,7 @@ class KitchenTask(gymnasium.Env[np.ndarray, np.ndarray]):
         self._env = kitchen_env.KitchenEnv([NAMES[sub_task] for sub_task in chain])
         self.model, self.data = self._env.model, self._env.data
         self._rest = self._env.robot_env.init_qpos
-        spread = [START_ANGLE] * 7 + [START_KETTLE] * 2
-        self._spread = start_noise * np.array(spread)
+        self._spread = start_noise * np.array([START_ANGLE] * 7 + [START_KETTLE] * 2)
         self.observation_space = Box(-np.inf, np.inf, (30,), np.float64)
         self.action_space = Box(-1, 1, (9,), np.float64)
 

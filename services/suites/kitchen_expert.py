@@ -16,6 +16,7 @@ from typing import Any
 import mujoco as compiled_mujoco
 import numpy as np
 from jaxtyping import Float32, Float64
+from numpy.typing import ArrayLike
 
 from services.suites.inverse_kinematics import Arm, Pose, bounded_least_squares, pose_error
 
@@ -26,7 +27,6 @@ STEP = 0.08
 REACH = 2 * STEP
 """How far, in radians or metres, an action of 1 sets a joint's goal ahead of the joint."""
 JOINTS = 7
-LIFT = np.array([0.0, 0.0, 1.0])
 
 
 @cache
@@ -76,7 +76,8 @@ class SubTask:
     """What it shall become: well beyond the environment's threshold."""
     contact: Callable[[Scene], Float64[np.ndarray, "3"]]
     """Where the hand touches the object."""
-    act: Callable[[Scene], Target]
+    act: Callable[[Scene, Float64[np.ndarray, "3"]], Target]
+    """Returns where the hand shall go, given where it touches the object."""
     clearance: float = 0.10
     """Metres between hand and object from which the hand is free to travel."""
     pushed: bool = False
@@ -156,14 +157,14 @@ def push(
     return travel(scene, at(beside, -0.10, "").pose, posture, True)
 
 
-def microwave_handle(scene: Scene) -> Float64[np.ndarray, "3"]:
-    """Return where the door's handle is, in metres."""
-    return scene.site("microhandle_site")
+def beside(site: str, offset: ArrayLike = (0, 0, 0)) -> Callable[[Scene], Float64[np.ndarray, "3"]]:
+    """Return what finds the point at an offset from a site, in metres."""
+    return lambda scene: scene.site(site) + np.asarray(offset)
 
 
-def microwave(scene: Scene) -> Target:
+def microwave(scene: Scene, handle: Float64[np.ndarray, "3"]) -> Target:
     """Take the door's handle and draw it around its hinge."""
-    handle, angle = microwave_handle(scene), scene.qpos[22]
+    angle = scene.qpos[22]
     hinge = np.array([-1.127, 0.454, handle[2]])
     rotation = orient((-0.2 + 0.5 * angle, 1, -0.03), (1, 0, 0))
     posture = np.array([-1.24, -1.76, 1.88, -1.4, -0.7, 1.25, 2.5])
@@ -175,13 +176,11 @@ def kettle_pillar(scene: Scene) -> Float64[np.ndarray, "3"]:
     """Return where the left of the two pillars under the kettle's handle is, in metres."""
     axes = np.zeros(9)
     mujoco.mju_quat2Mat(axes, scene.qpos[26:30])
-    pillar = scene.qpos[23:26] + axes.reshape(3, 3) @ np.array([-0.092, 0, 0.18])
-    return pillar
+    return scene.qpos[23:26] + axes.reshape(3, 3) @ np.array([-0.092, 0, 0.18])
 
 
-def kettle(scene: Scene) -> Target:
+def kettle(scene: Scene, pillar: Float64[np.ndarray, "3"]) -> Target:
     """Take the left pillar, and carry the kettle to the back with its weight half lifted."""
-    pillar = kettle_pillar(scene)
     way = (np.array([-0.29, 0.75, 0]) - pillar) * [3, 1, 0]  # first to the right, past the microwave's corner
     pushed = (scene.qpos[24] - 0.40) / 0.30
     rotation = orient((0.34 - 0.2 * pushed, 1, -0.05 + 0.1 * pushed), (1, 0, 0.15))
@@ -196,51 +195,34 @@ def burner(knob: str, joint: int) -> SubTask:
     """Return the sub-task of turning a knob: take it by its sides, then roll the hand."""
     ahead, posture = np.array([0.05, 1, 0.12]), np.array([-1.33, -1.4, 1.55, -2.3, 0.4, 1.95, 1.6])
 
-    def contact(scene: Scene) -> Float64[np.ndarray, "3"]:
-        return scene.site(knob) - 0.04 * ahead / np.linalg.norm(ahead)
-
-    def act(scene: Scene) -> Target:
+    def act(scene: Scene, contact: Float64[np.ndarray, "3"]) -> Target:
         def rolled(angle: float, at: Float64[np.ndarray, "3"]) -> Pose:
             return Pose(at, orient(ahead.tolist(), (np.cos(angle), 0, np.sin(angle))))
 
         angle = scene.qpos[joint]
         moved = rolled(angle - 0.4, scene.site(knob))  # pressed against the knob, the fingers slip less
-        return take(scene, rolled(angle, contact(scene)), moved, posture, 0.045)
+        return take(scene, rolled(angle, contact), moved, posture, 0.045)
 
+    contact = beside(knob, -0.04 * ahead / np.linalg.norm(ahead))
     return SubTask(joint, 0, -0.9, contact, act, clearance=0.07)
 
 
-def light_lever(scene: Scene) -> Float64[np.ndarray, "3"]:
-    """Return where the fingers touch the light's lever, in metres."""
-    return scene.site("light_site") + np.array([0, -0.02, 0])
-
-
-def light(scene: Scene) -> Target:
+def light(scene: Scene, lever: Float64[np.ndarray, "3"]) -> Target:
     """Push the lever to the left."""
     posture = np.array([-1.25, -1.55, 1.44, -2.0, 0.65, 1.65, 0.94])
-    return push(scene, light_lever(scene), 1, 0.06, orient((0.03, 1, 0.13), (1, 0, 0)), posture)
+    return push(scene, lever, 1, 0.06, orient((0.03, 1, 0.13), (1, 0, 0)), posture)
 
 
-def slide_handle(scene: Scene) -> Float64[np.ndarray, "3"]:
-    """Return where the fingers touch the sliding door's handle, in metres."""
-    return scene.site("slide_site") - 0.05 * LIFT
-
-
-def slide(scene: Scene) -> Target:
+def slide(scene: Scene, handle: Float64[np.ndarray, "3"]) -> Target:
     """Push the sliding door to the right by its handle."""
     posture = np.array([-1.8, -1.4, 1.05, -1.98, 0.4, 1.78, 0.9])
     rotation = orient((0.45 + 0.8 * scene.qpos[19], 0.7, 0.5), (0.85, -0.5, 0))
-    return push(scene, slide_handle(scene), -1, 0.07, rotation, posture)
+    return push(scene, handle, -1, 0.07, rotation, posture)
 
 
-def hinge_handle(scene: Scene) -> Float64[np.ndarray, "3"]:
-    """Return where the fingers take the right hinged door's handle, in metres."""
-    return scene.site("hinge_site2") - 0.06 * LIFT
-
-
-def hinge(scene: Scene) -> Target:
+def hinge(scene: Scene, handle: Float64[np.ndarray, "3"]) -> Target:
     """Take the door's handle and draw it around its hinge; the arm folds as the door opens."""
-    handle, angle = hinge_handle(scene), scene.qpos[21]
+    angle = scene.qpos[21]
     axis = np.array([-0.224, 0.71, handle[2]])
     rotation = orient((0.03 + 0.3 * angle, 0.8, 0.58), (1, -0.05 - 0.3 * angle, 0))
     closed, half_open = (-1.73, -1.69, 0.81, -1.36, 0.74, 1.28, 0.88), (-1.29, -1.76, 0.88, -2.02, 0.74, 1.42, 0.51)
@@ -250,13 +232,13 @@ def hinge(scene: Scene) -> Target:
 
 
 SUB_TASKS: Mapping[str, SubTask] = {
-    "microwave": SubTask(22, 0, -0.8, microwave_handle, microwave),
+    "microwave": SubTask(22, 0, -0.8, beside("microhandle_site"), microwave),
     "kettle": SubTask(24, 0.35, 0.65, kettle_pillar, kettle, clearance=0.16),
     "bottomburner": burner("knob2_site", 11),
     "topburner": burner("knob4_site", 15),
-    "light": SubTask(17, 0, -0.65, light_lever, light, pushed=True),
-    "slide": SubTask(19, 0, 0.3, slide_handle, slide, pushed=True),
-    "hinge": SubTask(21, 0, 1.35, hinge_handle, hinge),
+    "light": SubTask(17, 0, -0.65, beside("light_site", (0, -0.02, 0)), light, pushed=True),
+    "slide": SubTask(19, 0, 0.3, beside("slide_site", (0, 0, -0.05)), slide, pushed=True),
+    "hinge": SubTask(21, 0, 1.35, beside("hinge_site2", (0, 0, -0.06)), hinge),
 }
 """In the order in which the expert does them: the open hinge door would be in the way of the slide cabinet."""
 
@@ -293,7 +275,7 @@ class KitchenExpert:
                 return Target(Pose(hand.position + back, hand.rotation), scene.qpos[:JOINTS], sub_task.pushed, "leave")
         for sub_task, is_done in zip(self._chain, done, strict=True):
             if not is_done:
-                return sub_task.act(scene)
+                return sub_task.act(scene, sub_task.contact(scene))
         return Target(hand, scene.qpos[:JOINTS], False, "rest")
 
     def _towards(self, target: Target, scene: Scene) -> Float64[np.ndarray, "7"]:

@@ -6,6 +6,7 @@ goal so far behind the wall's two faces that the straight way between them alway
 """
 
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import mujoco as compiled_mujoco
@@ -131,21 +132,11 @@ class PushAroundWallEnv(SawyerPushWallEnvV3):
     ) -> tuple[float, dict[str, Any]]:
         """Judge the step that led to `obs`: it prolongs the cube's path."""
         self._path = self._path.to(obs[4:7])
-        (
-            reward,
-            tcp_to_obj,
-            tcp_open,
-            obj_to_target,
-            grasp_reward,
-            in_place_reward,
-        ) = self.compute_reward(action, obs)
-        success = float(self._path.done and obj_to_target <= GOAL_RADIUS)
-        near_object = float(tcp_to_obj <= 0.03)
-        grasp_success = float(self.touching_main_object and (tcp_open > 0) and (obs[6] - 0.02 > self._start[2]))
+        reward, tcp_to_obj, tcp_open, obj_to_target, grasp_reward, in_place_reward = self.compute_reward(action, obs)
         info = {
-            "success": success,
-            "near_object": near_object,
-            "grasp_success": grasp_success,
+            "success": float(self._path.done and obj_to_target <= GOAL_RADIUS),
+            "near_object": float(tcp_to_obj <= 0.03),
+            "grasp_success": float(self.touching_main_object and tcp_open > 0 and obs[6] - 0.02 > self._start[2]),
             "grasp_reward": grasp_reward,
             "in_place_reward": in_place_reward,
             "obj_to_target": obj_to_target,
@@ -165,18 +156,12 @@ class PushAroundWallEnv(SawyerPushWallEnvV3):
         tcp_to_obj = float(np.linalg.norm(cube - self.tcp_center))
         obj_to_target = float(np.linalg.norm(cube - target))
         scaling = np.array([3.0, 1.0, 1.0])
-        beside_wall = reward_utils.tolerance(
+        near = partial(reward_utils.tolerance, bounds=(0, 0.05), sigmoid="long_tail")
+        beside_wall = near(
             float(np.linalg.norm((cube - self._way_point) * scaling)),
-            bounds=(0, 0.05),
             margin=float(np.linalg.norm((self._start - self._way_point) * scaling)),
-            sigmoid="long_tail",
         )
-        in_place = reward_utils.tolerance(
-            obj_to_target,
-            bounds=(0, 0.05),
-            margin=float(np.linalg.norm(self._start - target)),
-            sigmoid="long_tail",
-        )
+        in_place = near(obj_to_target, margin=float(np.linalg.norm(self._start - target)))
         grasped = self._gripper_caging_reward(
             action,
             cube,

@@ -2,7 +2,6 @@
 
 import os
 from importlib import import_module
-from types import TracebackType
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -89,9 +88,7 @@ class Camera:
         """Draw."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """See `close`."""
         self.close()
 
