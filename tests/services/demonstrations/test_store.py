@@ -270,6 +270,7 @@ def digests(experiment: Experiment, kind, workers: int | None) -> dict[str, tupl
         return {task: (dataset.digest, dataset.failed) for task, dataset in experiment.collect(runner).items()}
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("joined")
 def test_whoever_collects_the_demonstrations_are_the_same(tmp_path: Path):
     settings = ExperimentConfig.model_validate(

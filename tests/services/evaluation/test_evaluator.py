@@ -28,6 +28,7 @@ def rows(folder: Path) -> list[EpisodeResult | AdaptationResult]:
     ]
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("joined")
 def test_the_rows_do_not_depend_on_when_and_where_they_are_made(workplace: Path, train, mlflow_file: str):
     found = {}
