@@ -21,8 +21,9 @@ from services.demonstrations.store import data_root
 from services.distributed.cluster import joined
 from services.distributed.node_info import NodeFacts, cluster_facts, facts
 from services.storage.files import DiskFullError, write_file
+from services.storage.redaction import error_line, redacted
 from services.tracking.delivery import set_mlflow_defaults
-from services.tracking.links import error_line, redacted, tracking_uri
+from services.tracking.links import tracking_uri
 
 Verdict = Literal["good", "warning", "bad"]
 DISK_BYTES = 2 * 10**9

@@ -27,6 +27,7 @@ from services.experiments.finished_run import FinishedRun
 from services.reporting.end_of_run import PAGE, publish, show, write_report
 from services.storage.checkpoints import Checkpoint, Checkpoints
 from services.storage.files import read_file, write_file
+from services.storage.redaction import redacted
 from services.storage.remote import STORAGE
 from services.storage.replication import replicated, restored
 from services.storage.run_folders import find_folder, new_folder
@@ -147,7 +148,7 @@ def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]
     runs = early.runs or Arguments.runs
     wanted = Path(early.resume) if Path(early.resume).name != early.resume else runs / early.resume
     if restored(wanted):
-        console.print(f"fetched from {os.environ[STORAGE]}: {wanted}", markup=False)
+        console.print(f"fetched from {redacted(os.environ[STORAGE])}: {wanted}", markup=False)
     folder = find_folder(early.resume, runs, MARK)
     try:
         before = ExperimentConfig.model_validate_json(read_file(folder / MARK, MOST_BYTES))

@@ -30,6 +30,7 @@ from dmil_core.errors import explain
 from dmil_core.trajectories import Episode
 from services.storage.checksums import check_listing, write_listing
 from services.storage.files import inside, read_file, room_for, sync
+from services.storage.redaction import error_line
 from services.storage.remote import Storage, given_storage
 from services.suites.base import TaskSuite
 
@@ -192,7 +193,7 @@ class DemoStore:
         try:
             return self._storage.get_folder(f"data/{dataset_id}", self.root / dataset_id, FILES, DIGESTS)
         except Exception as error:  # noqa: BLE001  whatever a storage raises, demonstrations can be made again
-            logger.warning(f"{self._storage.url} gives no {dataset_id}: {error}")
+            logger.warning(f"{self._storage.url} gives no {dataset_id}: {error_line(error)}")
             return False
 
     def _copy(self, dataset_id: str) -> None:
@@ -203,7 +204,7 @@ class DemoStore:
         try:
             self._storage.put_folder(f"data/{dataset_id}", contents, DIGESTS)
         except Exception as error:  # noqa: BLE001  whatever a storage raises, they are here
-            logger.warning(f"{self._storage.url} does not take {dataset_id}: {error}")
+            logger.warning(f"{self._storage.url} does not take {dataset_id}: {error_line(error)}")
 
 
 def open_store() -> DemoStore:

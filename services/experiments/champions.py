@@ -17,9 +17,10 @@ from services.evaluation.comparison import Comparison, Contender, Difference, Un
 from services.evaluation.summary import Evaluation
 from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoint
+from services.storage.redaction import error_line, redacted
 from services.suites.registry import open_suite
 from services.tracking.delivery import IDENTITY, Identity, set_mlflow_defaults
-from services.tracking.links import error_line, redacted, tracking_uri
+from services.tracking.links import tracking_uri
 from services.tracking.models import CHECKPOINT_TAG, checkpoint_in, models_of
 
 if TYPE_CHECKING:

@@ -13,6 +13,7 @@ from pathlib import Path
 import fsspec
 
 from dmil_core.errors import RunError, UserError
+from services.storage.redaction import redacted
 
 STORAGE = "DMIL_STORAGE"
 PACKAGES = {"s3": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs"}
@@ -28,14 +29,15 @@ class Storage:
         Raises:
             UserError: if the URL names none.
         """
-        self.url = url
+        self.url = redacted(url)
+        """Where it is, without secrets."""
         try:
             self._files, root = fsspec.core.url_to_fs(url, use_listings_cache=False)
         except ImportError as error:
             package = PACKAGES.get(url.partition(":")[0], "the package that it names")
-            raise UserError(f"{STORAGE}: got {url}, which needs {package}: pip install {package}") from error
+            raise UserError(f"{STORAGE}: got {self.url}, which needs {package}: pip install {package}") from error
         except ValueError as error:
-            raise UserError(f"{STORAGE}: got {url} ({error}); wanted a URL as {KINDS}") from error
+            raise UserError(f"{STORAGE}: got {self.url} ({redacted(str(error))}); wanted a URL as {KINDS}") from error
         self._root = root.rstrip("/")
 
     def put(self, name: str, content: bytes) -> None:

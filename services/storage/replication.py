@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from services.storage.checkpoints import FILES, MARKER
+from services.storage.redaction import error_line
 from services.storage.remote import Storage, given_storage
 
 logger = logging.getLogger(__name__)
@@ -134,9 +135,7 @@ def replicated(folder: Path, place: str = "runs", *, restore: bool = False) -> I
             replica.copy()
         except Exception as error:  # noqa: BLE001  whatever a storage raises, the run goes on
             if not complained.is_set():
-                logger.warning(
-                    f"{storage.url} does not take the copy of {folder} ({type(error).__name__}: {error}); going on"
-                )
+                logger.warning(f"{storage.url} does not take the copy of {folder} ({error_line(error)}); going on")
             complained.set()
             return False
         return True
@@ -150,7 +149,7 @@ def replicated(folder: Path, place: str = "runs", *, restore: bool = False) -> I
             if replica.restore():
                 logger.info(f"{folder}: fetched from {storage.url}")
         except Exception as error:  # noqa: BLE001  as above
-            logger.warning(f"{storage.url} does not give {folder} ({type(error).__name__}: {error}); going on without")
+            logger.warning(f"{storage.url} does not give {folder} ({error_line(error)}); going on without")
     thread = threading.Thread(target=work, name="replica", daemon=True)
     thread.start()
     try:

@@ -15,9 +15,10 @@ from tyro.conf import Positional
 from dmil_core.errors import RunError, UserError
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
+from services.storage.redaction import error_line, redacted
 from services.storage.run_folders import find_folder
 from services.tracking.delivery import Delivery
-from services.tracking.links import error_line, redacted, tracking_uri
+from services.tracking.links import tracking_uri
 from services.tracking.spool import Artifact, Spool
 
 REPORT = "report"

@@ -2,11 +2,8 @@
 
 import json
 import os
-import re
 from collections.abc import Sequence
 from urllib.parse import quote, urlsplit, urlunsplit
-
-from dmil_core.errors import RunError, UserError
 
 DEFAULT_URI = "sqlite:///mlflow.db"
 LOCAL = "http://127.0.0.1:5000"
@@ -19,18 +16,6 @@ TRAINING = "workflowType=machine_learning"
 def tracking_uri() -> str:
     """Return ``MLFLOW_TRACKING_URI``, or an SQLite file in the working directory."""
     return os.environ.get("MLFLOW_TRACKING_URI") or DEFAULT_URI
-
-
-def redacted(text: str) -> str:
-    """Return an address, or a text with addresses in it, without users, passwords and tokens."""
-    text = re.sub(r"://[^\s'\"]*@", "://...@", text)
-    return re.sub(r"(?i)((?:password|passwd|token|secret|key)=)[^&\s'\"]+", r"\1...", text)
-
-
-def error_line(error: Exception) -> str:
-    """Return an error of MLflow, or of what is below it, in one line without secrets."""
-    text = redacted(" ".join(str(error).split()))
-    return text if isinstance(error, UserError | RunError) else f"{type(error).__name__}: {text[:200]}"
 
 
 def run_link(uri: str, experiment_id: str, run_id: str) -> str:

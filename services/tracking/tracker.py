@@ -11,8 +11,9 @@ from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import RunError
 from services.storage.provenance import git_commit, library_versions
+from services.storage.redaction import error_line, redacted
 from services.tracking.delivery import Delivery, Identity
-from services.tracking.links import error_line, how_to_look, redacted, run_link, tracking_uri
+from services.tracking.links import how_to_look, run_link, tracking_uri
 from services.tracking.packing import packed
 from services.tracking.spool import Artifact, Ended, Example, Measured, Spool, Trained
 
