@@ -18,11 +18,11 @@ from dmil_core.errors import RunError
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.demonstrations.store import data_root
-from services.distributed.cluster import joined
+from services.distributed.cluster import joined, named_address
 from services.distributed.node_info import NodeFacts, cluster_facts, facts
 from services.storage.files import DiskFullError, write_file
 from services.storage.redaction import error_line, redacted
-from services.tracking.delivery import set_mlflow_defaults
+from services.tracking.client import connect
 from services.tracking.links import tracking_uri
 
 Verdict = Literal["good", "warning", "bad"]
@@ -62,7 +62,7 @@ def run(arguments: Sequence[str]) -> None:
     given = parse(Arguments, __doc__ or "", arguments, Arguments())
     mark = f".doctor-{uuid4().hex}"
     findings = [*_storage("runs", given.runs, mark), *_storage("demonstrations", data_root(), mark)]
-    if "RAY_ADDRESS" in os.environ:
+    if named_address() is not None:
         with joined(), _marked(given.runs / mark):
             nodes, silent = cluster_facts(given.runs, mark)
     else:
@@ -177,12 +177,9 @@ def _storage(what: str, folder: Path, mark: str) -> Iterator[Finding]:
 def _mlflow() -> Finding:
     """Make a run in MLflow and delete it."""
     os.environ["MLFLOW_HTTP_REQUEST_TIMEOUT"] = SECONDS_FOR_MLFLOW
-    set_mlflow_defaults()
-    from mlflow import MlflowClient
-
     uri = tracking_uri()
     try:
-        client = MlflowClient(uri)
+        client = connect(uri)
         experiment = client.get_experiment_by_name("dmil-doctor")
         made = client.create_experiment("dmil-doctor") if experiment is None else experiment.experiment_id
         run_id = client.create_run(made).info.run_id

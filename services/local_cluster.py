@@ -1,23 +1,23 @@
 """A Ray head and an MLflow server on this machine, on loopback, for Ray jobs: ``make cluster``, ``make cluster-stop``.
 
-Jobs run in the folder that it was started in, and log to that MLflow server. Its token lies in FOLDER/token.
+Jobs run in the folder that it was started in, and log to that MLflow server. The token of both lies in FOLDER/token.
 """
 
 import os
 import secrets
 import shutil
 import socket
+import stat
 import subprocess
 import sys
-import tempfile
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
+from urllib.error import HTTPError
+from urllib.request import ProxyHandler, Request, build_opener, getproxies, proxy_bypass
 
 import psutil
 import tyro
@@ -27,6 +27,8 @@ from dmil_core.errors import RunError, UserError, explain
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.storage.files import read_file, write_file
+from services.storage.private import bypass_proxies, make_private_folder
+from services.tracking.server import LOGINS, server_command, server_environment
 
 SECONDS_TO_START = 120.0
 SECONDS_TO_STOP = 20.0
@@ -41,9 +43,9 @@ OURS = {
     "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # listen on loopback only
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_JOB_STOP_WAIT_TIME_S": str(SECONDS_FOR_A_JOB),
-    "MLFLOW_DISABLE_TELEMETRY": "true",
-    "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",  # 2 processes in place of 10
 }
+MARK = "made-for"
+"""In the folder of Ray's sockets and logs, names the cluster's own: a note that anybody wrote has no folder removed."""
 
 
 @dataclass(frozen=True)
@@ -148,10 +150,13 @@ def _start(settings: Arguments) -> None:
     _check_space(folder, DISK_BYTES, "free some, or start in another folder")
     _check_space(Path("/dev/shm"), settings.object_store_megabytes * 10**6, "--object-store-megabytes less")
     dashboard, mlflow = (f"http://127.0.0.1:{port}" for port in (settings.dashboard_port, settings.mlflow_port))
-    environment = {**os.environ, **OURS, "RAY_AUTH_TOKEN_PATH": str(token), "MLFLOW_TRACKING_URI": mlflow}
+    environment = {name: value for name, value in os.environ.items() if name not in ("RAY_ADDRESS", *LOGINS)}
+    environment |= {**OURS, "RAY_AUTH_TOKEN_PATH": str(token), "MLFLOW_TRACKING_URI": mlflow}
+    environment |= server_environment(f"sqlite:///{Path.cwd() / 'mlflow.db'}", token.read_text())
     environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{environment.get('PATH', '')}"
-    environment.pop("RAY_ADDRESS", None)
-    temporary = Path(tempfile.mkdtemp(prefix="dmil-"))  # short: paths of Ray's sockets have 107 bytes at most
+    bypass_proxies(environment)
+    temporary = make_private_folder()
+    (temporary / MARK).write_bytes(os.fsencode(folder))
     started: list[Started] = []
     try:
         for server in _servers(settings, temporary, dashboard, mlflow):
@@ -169,33 +174,35 @@ def _start(settings: Arguments) -> None:
         _stop(settings.folder)
         raise
     auth = f"RAY_AUTH_MODE=token RAY_AUTH_TOKEN_PATH={token}"
+    if "http" in getproxies() and not proxy_bypass("127.0.0.1"):
+        auth += f" no_proxy={environment['no_proxy']}"
     job = "python -m services.meta_train --preset ml10-smoke"
-    console.print(f"Ray dashboard: {dashboard} (it asks for the token in {token})", soft_wrap=True)
-    console.print(f"MLflow:        {mlflow}")
-    console.print(f"jobs:          {dashboard}, for example:\n")
     ray = Path(sys.executable).with_name("ray")
-    console.print(f"{auth} {ray} job submit --address {dashboard} -- {job}\n", soft_wrap=True, markup=False)
+    login = f"MLFLOW_TRACKING_URI={mlflow} MLFLOW_TRACKING_TOKEN=$(cat {token})"
+    for line in (
+        f"Ray dashboard: {dashboard} (it asks for the token in {token})",
+        f"MLflow:        {mlflow} (any user; the token is the password)",
+        f"from a shell:  {login}",
+        f"jobs:          {dashboard}, for example:\n",
+        f"{auth} {ray} job submit --address {dashboard} -- {job}\n",
+    ):
+        console.print(line, soft_wrap=True, markup=False)
     console.print("to stop both: make cluster-stop")
 
 
 def _servers(settings: Arguments, temporary: Path, dashboard: str, mlflow: str) -> list[Server]:
     """Return MLflow first: jobs log to it."""
-    home = Path.cwd()
     ray = [
         sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block", "--node-ip-address=127.0.0.1",
         f"--port={settings.ray_port}", "--dashboard-host=127.0.0.1", f"--dashboard-port={settings.dashboard_port}",
-        "--include-dashboard=true", f"--dashboard-agent-listen-port={_free_port()}", f"--temp-dir={temporary}",
+        "--include-dashboard=true", f"--dashboard-agent-listen-port={_free_port()}", f"--temp-dir={temporary / 'ray'}",
         f"--object-store-memory={settings.object_store_megabytes * 10**6}", "--disable-usage-stats",
     ]  # fmt: skip
     if settings.cpus is not None:
         ray.append(f"--num-cpus={settings.cpus}")
-    server = [
-        sys.executable, "-m", "mlflow", "server", "--backend-store-uri", f"sqlite:///{home / 'mlflow.db'}",
-        "--artifacts-destination", str(home / "mlartifacts"), "--host", "127.0.0.1",
-        "--port", str(settings.mlflow_port), "--workers", "1",
-    ]  # fmt: skip
+    server = server_command(Path.cwd() / "mlartifacts", settings.mlflow_port)
     return [
-        Server("mlflow", server, f"{mlflow}/health"),
+        Server("mlflow", server, f"{mlflow}/version"),
         Server("ray", ray, f"{dashboard}/api/version"),
     ]
 
@@ -214,16 +221,21 @@ def _check_not_running(folder: Path) -> None:
 
 
 def _token(folder: Path) -> Path:
-    """Return the file of the token, made if there is none yet.
+    """Return the file of the token, which is made if there is none yet, or others could read or replace it.
 
     Raises:
-        UserError: if the environment has another, which Ray's programs would use.
+        UserError: if the folder or the token is somebody else's, or the environment has another token, which Ray's
+            programs would use.
     """
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     path = folder / "token"
-    if not path.exists():
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with os.fdopen(descriptor, "w") as file:
+    if exposed := _exposure(folder, 0o022) or _exposure(path, 0o077):
+        console.print(f"{exposed}, open to other users; it is closed, and a new token made", soft_wrap=True)
+        folder.chmod(0o700)
+        path.unlink(missing_ok=True)
+    if not path.exists() or path.stat().st_size == 0:  # empty: a start was killed
+        path.unlink(missing_ok=True)
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
             file.write(secrets.token_hex(32))
     if os.environ.get("RAY_AUTH_TOKEN", (token := path.read_text())) != token:
         raise UserError(
@@ -235,6 +247,20 @@ def _token(folder: Path) -> Path:
             f"RAY_AUTH_TOKEN_PATH: got {os.environ['RAY_AUTH_TOKEN_PATH']}; wanted {path}, or none: unset it"
         )
     return path
+
+
+def _exposure(path: Path, closed: int) -> str | None:
+    """Return how others can get at a path by its mode bits `closed`, or None.
+
+    Raises:
+        UserError: if it is a link, or somebody else's.
+    """
+    if not os.path.lexists(path):
+        return None
+    found = path.lstat()
+    if stat.S_ISLNK(found.st_mode) or found.st_uid != os.geteuid():
+        raise UserError(f"{path}: got a link, or another user's; wanted your own; remove it, or give another --folder")
+    return f"{path}: got mode {stat.S_IMODE(found.st_mode):04o}" if found.st_mode & closed else None
 
 
 def _free_port() -> int:
@@ -284,11 +310,13 @@ def _wait(server: Server, process: subprocess.Popen[bytes], log: Path, token: st
 
 
 def _answers(url: str, token: str) -> bool:
-    request = urllib.request.Request(url, headers={"Authorization": f"Bearer {token}"})
+    """Ask a server of this machine: directly, and with the token for itself alone, wherever it redirects."""
+    request = Request(url)
+    request.add_unredirected_header("Authorization", f"Bearer {token}")
     try:
-        with urllib.request.urlopen(request, timeout=5) as answer:
+        with build_opener(ProxyHandler({})).open(request, timeout=5) as answer:
             return answer.status == 200
-    except urllib.error.HTTPError as error:
+    except HTTPError as error:
         if error.code in (401, 403):
             raise RunError(f"{url}: refuses the token of this cluster; it belongs to another one") from error
         return False
@@ -314,9 +342,25 @@ def _stop(folder: Path) -> None:
         with suppress(psutil.NoSuchProcess):
             process.kill()
     psutil.wait_procs(alive, SECONDS_TO_STOP)
-    shutil.rmtree(record.temporary, ignore_errors=True)
+    if _made_for(record.temporary, folder.absolute()):
+        shutil.rmtree(record.temporary, ignore_errors=True)
+    elif record.temporary.exists():
+        console.print(
+            f"{folder / 'cluster.json'}: temporary: got {record.temporary}, which was not made for this cluster: it "
+            "stays", soft_wrap=True, markup=False,
+        )  # fmt: skip
     (folder / "cluster.json").unlink()
     console.print(f"stopped: {len(processes)} processes" if processes else "nothing of it was running any more")
+
+
+def _made_for(temporary: Path, folder: Path) -> bool:
+    """Tell whether a folder is the private one that was made for the cluster in `folder`."""
+    try:
+        found = temporary.lstat()
+        private = stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077
+        return private and read_file(temporary / MARK, MOST_BYTES) == os.fsencode(folder)
+    except OSError:
+        return False
 
 
 if __name__ == "__main__":

@@ -6,9 +6,14 @@ import secrets
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+
+from dmil_core.errors import UserError
+from services.storage.private import bypass_proxies, private_folder
+from services.storage.redaction import error_line, redacted
 
 OBJECT_STORE_BYTES = 500_000_000
+SECONDS_TO_ANSWER = 10.0
 
 
 @contextmanager
@@ -16,10 +21,14 @@ def joined(workers: int | None = None) -> Iterator[None]:
     """Be in a cluster, and leave it in the end.
 
     It is the one joined already, as in a trial of a sweep, which is not left; the one that ``RAY_ADDRESS`` names, as in
-    a Ray job; or one on this machine alone that listens on loopback only,
-    with at least `workers` CPUs.
+    a Ray job; or one on this machine alone that listens on loopback only, with at least `workers` CPUs.
+
+    Raises:
+        UserError: if nothing that can be joined answers at ``RAY_ADDRESS``.
     """
-    if "RAY_ADDRESS" not in os.environ:
+    bypass_proxies(os.environ)
+    address = named_address()
+    if address is None:
         _secure_local_cluster()
     # Ray would print every error of a call that the pool made again.
     os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")
@@ -29,24 +38,56 @@ def joined(workers: int | None = None) -> Iterator[None]:
         yield
         return
     on_termination = signal.getsignal(signal.SIGTERM)
-    if "RAY_ADDRESS" in os.environ:
-        ray.init(logging_level=logging.WARNING)
-    else:
-        ray.init(
-            address="local",
-            num_cpus=max(os.cpu_count() or 1, workers or 0),
-            include_dashboard=False,
-            object_store_memory=OBJECT_STORE_BYTES,
-            logging_level=logging.WARNING,
-            log_to_driver=False,
-            _node_ip_address="127.0.0.1",
-        )
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, on_termination)  # Ray puts its own there, which ends at once
-    try:
+    with ExitStack() as stack:
+        if address is None:
+            folder = stack.enter_context(private_folder())
+            stack.callback(ray.shutdown)
+            ray.init(
+                address="local",
+                num_cpus=max(os.cpu_count() or 1, workers or 0),
+                include_dashboard=False,
+                object_store_memory=OBJECT_STORE_BYTES,
+                logging_level=logging.WARNING,
+                log_to_driver=False,
+                _node_ip_address="127.0.0.1",
+                _temp_dir=str(folder / "ray"),
+            )
+        else:
+            stack.callback(ray.shutdown)
+            _join(address)
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, on_termination)  # Ray puts its own there, which ends at once
         yield
-    finally:
-        ray.shutdown()
+
+
+def named_address() -> str | None:
+    """Return what ``RAY_ADDRESS`` names, or None if it is unset, empty or ``local``: a cluster of one's own."""
+    address = os.environ.get("RAY_ADDRESS", "")
+    return None if address in ("", "local") else address
+
+
+def _join(address: str) -> None:
+    """Join a cluster; Ray itself would try for minutes where none listens.
+
+    Raises:
+        UserError: if nothing answers there as a Ray of this version, with this token.
+    """
+    import grpc
+    import ray
+
+    host = address.removeprefix("ray://")
+    wanted = "wanted HOST:PORT of a Ray head that runs, or unset it for a Ray of this run's own"
+    if "://" in host:
+        raise UserError(f"RAY_ADDRESS: got {redacted(address)}, perhaps of a dashboard, which takes jobs; {wanted}")
+    try:
+        if address != "auto" and os.environ.get("RAY_USE_TLS", "0") == "0":
+            with grpc.insecure_channel(host, [("grpc.enable_http_proxy", 0)]) as channel:
+                grpc.channel_ready_future(channel).result(SECONDS_TO_ANSWER)
+        ray.init(address, logging_level=logging.WARNING)
+    except grpc.FutureTimeoutError:
+        raise UserError(f"RAY_ADDRESS: got {address}, where no Ray answers; {wanted}") from None
+    except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
+        raise UserError(f"RAY_ADDRESS: got {address}, which cannot be joined: {error_line(error)}; {wanted}") from error
 
 
 def cpus() -> int:
@@ -59,10 +100,11 @@ def cpus() -> int:
 def _secure_local_cluster() -> None:
     """Bind Ray to loopback, ask for a token that only this process's children know, send no usage statistics.
 
-    Ray reads these when it is imported.
+    Ray reads these when it is imported, also in the processes that it starts.
     """
+    os.environ.pop("RAY_ADDRESS", None)  # for Ray an empty one is set
     os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    if "RAY_AUTH_MODE" not in os.environ:
-        os.environ["RAY_AUTH_MODE"] = "token"
+    os.environ.setdefault("RAY_AUTH_MODE", "token")
+    if "RAY_AUTH_TOKEN_PATH" not in os.environ:
         os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))

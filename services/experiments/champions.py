@@ -19,7 +19,8 @@ from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoint
 from services.storage.redaction import error_line, redacted
 from services.suites.registry import open_suite
-from services.tracking.delivery import IDENTITY, Identity, set_mlflow_defaults
+from services.tracking.client import connect
+from services.tracking.delivery import IDENTITY, Identity
 from services.tracking.links import tracking_uri
 from services.tracking.models import CHECKPOINT_TAG, checkpoint_in, models_of
 
@@ -51,12 +52,9 @@ def open_contest(checkpoint: Checkpoint, experiment: Experiment, folder: Path) -
         UserError: if MLflow has no model of the checkpoint, or the champion is of another protocol.
         RunError: if MLflow does not answer, or has no registry.
     """
-    set_mlflow_defaults()
-    from mlflow import MlflowClient
-
     uri, name = tracking_uri(), experiment.suite.name
     with _asking(uri):
-        client = MlflowClient(uri)
+        client = connect(uri)
         challenger = _model_of(client, checkpoint)
         found = client.search_registered_models(f"name = '{name}'")
         has_one = bool(found) and ALIAS in found[0].aliases

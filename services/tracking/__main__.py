@@ -1,13 +1,15 @@
 """Deliver to MLflow what it did not take while a run was on, tell how much that is, or deliver the report once more.
 
-MLflow is where MLFLOW_TRACKING_URI says, and else the file mlflow.db in this folder.
+MLflow is where MLFLOW_TRACKING_URI says, and else the file mlflow.db in this folder: its pages are served by ui.
 """
 
+import os
+import secrets
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NoReturn
 
 import tyro
 from tyro.conf import Positional
@@ -18,7 +20,7 @@ from services.cli.progress import console
 from services.storage.redaction import error_line, redacted
 from services.storage.run_folders import find_folder
 from services.tracking.delivery import Delivery
-from services.tracking.links import tracking_uri
+from services.tracking.links import PORT, artifacts_beside, tracking_uri
 from services.tracking.spool import Artifact, Spool
 
 REPORT = "report"
@@ -29,12 +31,15 @@ REPORT = "report"
 class Arguments:
     """Arguments of ``tracking``."""
 
-    action: Positional[Literal["flush", "status", "report"]]
-    """Deliver what waits, tell what does, or deliver the folder report again, as it is after services.report."""
-    run: Positional[str]
+    action: Positional[Literal["flush", "status", "report", "ui"]]
+    """Deliver what waits, tell what does, deliver the folder report again, as it is after services.report, or serve
+    MLflow's pages to you alone."""
+    run: Positional[str] = ""
     """Name or folder of a run."""
     runs: Path = Path("runs")
     """The folder that runs' own folders are in."""
+    port: int = PORT
+    """That ui listens on."""
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -44,8 +49,10 @@ def run(arguments: Sequence[str]) -> None:
         UserError: if there is no such run.
         RunError: if MLflow does not take the records, or another process is delivering them.
     """
-    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, tyro.MISSING))
+    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
     uri = tracking_uri()
+    if given.action == "ui":
+        _serve(uri, given.port)
     folder = find_folder(given.run, given.runs, "tracking.jsonl", "RUN")
     if given.action == "report":
         _report(folder, uri)
@@ -56,6 +63,19 @@ def run(arguments: Sequence[str]) -> None:
             _flush(delivery, own, uri) if given.action == "flush" else _status(delivery)
         finally:
             delivery.close()
+
+
+def _serve(uri: str, port: int) -> NoReturn:
+    """Become MLflow's server, with a token of its own."""
+    if uri.startswith("http"):
+        raise UserError(f"MLFLOW_TRACKING_URI: got {redacted(uri)}, which has pages itself; wanted a database")
+    from services.tracking.server import server_command, server_environment
+
+    token = secrets.token_urlsafe()
+    console.print(f"MLflow: http://127.0.0.1:{port}\nuser:   any\npassword: {token}", markup=False, soft_wrap=True)
+    console.print("MLflow's own messages follow; Ctrl-C ends it")
+    command = server_command(artifacts_beside(uri) or Path("mlartifacts"), port)
+    os.execve(sys.executable, command, {**os.environ, **server_environment(uri, token)})
 
 
 def _flush(delivery: Delivery, folder: Path, uri: str) -> None:

@@ -1,6 +1,5 @@
 """From a run's folder to MLflow: every record in its order, noted as delivered once MLflow has taken it."""
 
-import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from filelock import FileLock, Timeout
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dmil_core.errors import RunError, UserError
 from services.storage.files import read_file, sync, write_file
+from services.tracking.client import connect, set_mlflow_defaults
+from services.tracking.links import artifacts_beside
 from services.tracking.sending import next_batch, send
 from services.tracking.spool import Line, read_spool
 
@@ -35,21 +36,6 @@ SENDING_SECONDS = 60.0
 IDENTITY = "mlflow_run.json"
 """In a run's folder."""
 IDENTITY_BYTES = 10_000
-MLFLOW_DEFAULTS = {
-    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "0",  # a call that MLflow's client made again by itself could make a second run
-    "MLFLOW_HTTP_REQUEST_TIMEOUT": "60",  # a slow answer is no trouble for a thread
-    "MLFLOW_DISABLE_TELEMETRY": "true",
-    "MLFLOW_LOGGING_LEVEL": "WARNING",  # it would print into the live screen
-    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
-}
-
-
-def set_mlflow_defaults() -> None:
-    """Set the environment variables that MLflow's client has for settings, where they are not set.
-
-    It takes them from nowhere else, and some when it is first imported: call this before.
-    """
-    os.environ.update({name: value for name, value in MLFLOW_DEFAULTS.items() if name not in os.environ})
 
 
 class Identity(BaseModel):
@@ -65,8 +51,8 @@ class Identity(BaseModel):
     """In milliseconds since 1970."""
     parent: str | None = None
     """The tag of the run that this one is a trial of; it goes to the same MLflow experiment."""
-    run_id: str | None = None
-    experiment_id: str | None = None
+    run_id: str | None = Field(None, pattern="^[0-9a-f]{32}$")
+    experiment_id: str | None = Field(None, pattern="^[0-9]{1,32}$")
     """Noted with the run's, but not in files of older versions."""
     delivered: int = 0
     """How many records MLflow has taken."""
@@ -201,10 +187,8 @@ class Delivery:
 
     def _open(self) -> "tuple[MlflowClient, str]":
         if self._client is None:
-            from mlflow import MlflowClient  # takes seconds to import: not before it is needed
-
             with self._asking():
-                self._client = MlflowClient(self._uri)
+                self._client = connect(self._uri)
         run_id = self.identity.run_id
         if run_id is None:
             experiment_id = self._experiment_in(self._client)
@@ -219,8 +203,9 @@ class Delivery:
             found = client.get_experiment_by_name(name)
         if found:
             return found.experiment_id
+        beside = artifacts_beside(self._uri)
         with self._asking():
-            return client.create_experiment(name, artifact_location=_beside(self._uri), tags=KIND)
+            return client.create_experiment(name, artifact_location=beside and beside.as_uri(), tags=KIND)
 
     def _run_in(self, client: "MlflowClient", experiment_id: str) -> str:
         """Return the id of our run: of one that was made before its id could be noted, or of a new one."""
@@ -256,17 +241,13 @@ class Delivery:
             self._asked = None
 
     def _note(self, **changed: Any) -> None:
-        self.identity = self.identity.model_copy(update=changed)
+        try:
+            self.identity = Identity.model_validate(self.identity.model_dump() | changed)
+        except ValidationError as error:
+            raise RunError(f"MLflow answered with no id of its own: {'; '.join(_problems(error))}") from error
         write_file(self._folder / IDENTITY, self.identity.model_dump_json())
 
 
 def _problems(error: ValidationError) -> Iterator[str]:
     for problem in error.errors(include_url=False):
         yield f"{'.'.join(map(str, problem['loc'])) or 'no object'}: {problem['msg']}"
-
-
-def _beside(uri: str) -> str | None:
-    """Return where artifacts go: beside an SQLite file, and else where the server says."""
-    if not uri.startswith("sqlite:///"):
-        return None
-    return (Path(uri.removeprefix("sqlite:///")).resolve().parent / "mlartifacts").as_uri()

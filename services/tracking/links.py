@@ -2,12 +2,15 @@
 
 import json
 import os
+import shlex
 from collections.abc import Sequence
+from pathlib import Path
 from urllib.parse import quote, urlsplit, urlunsplit
 
 DEFAULT_URI = "sqlite:///mlflow.db"
-LOCAL = "http://127.0.0.1:5000"
-"""Where ``mlflow ui`` serves what is no server itself."""
+PORT = 5000
+LOCAL = f"http://127.0.0.1:{PORT}"
+"""Where ``services.tracking ui`` serves what is no server itself."""
 
 TRAINING = "workflowType=machine_learning"
 """What has MLflow show its pages for training beside, not those for applications of language models."""
@@ -31,7 +34,15 @@ def comparison_link(uri: str, experiment_id: str, run_ids: Sequence[str]) -> str
 
 def how_to_look(uri: str) -> str | None:
     """Return the command that serves the pages of an MLflow that is a file, or None of one that serves them itself."""
-    return f"mlflow ui --backend-store-uri {uri} --host 127.0.0.1" if uri.startswith("sqlite") else None
+    if not uri.startswith("sqlite"):
+        return None
+    return f"{'' if uri == DEFAULT_URI else f'MLFLOW_TRACKING_URI={shlex.quote(uri)} '}python -m services.tracking ui"
+
+
+def artifacts_beside(uri: str) -> Path | None:
+    """Return where artifacts go: beside an SQLite file, and else where the server says."""
+    path = Path(uri.removeprefix("sqlite:///"))
+    return path.resolve().parent / "mlartifacts" if uri.startswith("sqlite:///") else None
 
 
 def _site(uri: str) -> str:
