@@ -41,11 +41,9 @@ def connect(uri: str) -> "MlflowClient":
     from mlflow import MlflowClient  # takes seconds to import: not before it is needed
     from mlflow.utils import request_utils
 
-    class Bounded(BoundedAnswers, request_utils.TCPKeepAliveHTTPAdapter):
-        """MLflow's own, with a limit; MLflow makes its sessions with what has this name."""
-
-    if not issubclass(request_utils.TCPKeepAliveHTTPAdapter, BoundedAnswers):
-        request_utils.TCPKeepAliveHTTPAdapter = Bounded
+    adapter = request_utils.TCPKeepAliveHTTPAdapter  # MLflow makes its sessions with what has this name
+    if not issubclass(adapter, BoundedAnswers):
+        request_utils.TCPKeepAliveHTTPAdapter = type("BoundedAdapter", (BoundedAnswers, adapter), {})
     return MlflowClient(uri)
 
 

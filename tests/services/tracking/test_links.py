@@ -24,6 +24,13 @@ def test_links_lead_to_the_pages_of_the_server_or_of_mlflow_ui_without_secrets(u
     assert "SECRET" not in comparison.geturl()
 
 
-def test_a_file_is_looked_at_with_mlflow_ui():
-    assert how_to_look("sqlite:///a.db") == "mlflow ui --backend-store-uri sqlite:///a.db --host 127.0.0.1"
-    assert how_to_look("http://127.0.0.1:5000") is None
+@pytest.mark.parametrize(
+    ("uri", "command"),
+    [
+        ("sqlite:///mlflow.db", "python -m services.tracking ui"),
+        ("sqlite:////a b/c.db", "MLFLOW_TRACKING_URI='sqlite:////a b/c.db' python -m services.tracking ui"),
+        ("http://127.0.0.1:5000", None),
+    ],
+)
+def test_a_file_is_looked_at_with_a_server_of_one_s_own(uri: str, command: str | None):
+    assert how_to_look(uri) == command
