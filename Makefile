@@ -42,8 +42,7 @@ endef
 test test-all: export OMP_NUM_THREADS = 1
 test: setup ## what proves the product, in some minutes: lint, format, types, imports and tests
 	$(CHECK)
-	$(BIN)/python -m pytest --ignore tests/deploy -m "not thorough and not alone" -n 2 --dist loadfile --durations 10
-	$(BIN)/python -m pytest --ignore tests/deploy -m "alone and not thorough" --durations 10
+	$(BIN)/python -m pytest --ignore tests/deploy -m "not thorough" -n 2 --dist loadfile --durations 10
 
 test-all: tools setup ## everything, also what wants a browser, a database, promtool, kubectl and half an hour
 	@$(INSTALL_CHECKERS)

@@ -17,6 +17,7 @@ def rows_of(program: str, *arguments: str, folder: Path) -> Any:
     return json.loads((folder / "rows.json").read_text())
 
 
+@pytest.mark.thorough
 def test_meta_gradient(tmp_path: Path) -> None:
     flags = ["--sizes", "quick", "--sub-skills", "2", "3", "--orders", "second", "--rounds", "1"]
     rows = rows_of("meta_gradient", *flags, folder=tmp_path)
@@ -39,7 +40,6 @@ def test_adaptation(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.alone
 def test_simulation(tmp_path: Path) -> None:
     rows = rows_of("simulation", "--quick", folder=tmp_path)
     *steps, median, evaluation = rows
@@ -52,7 +52,6 @@ def test_simulation(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.alone
 def test_scaling(tmp_path: Path) -> None:
     rows = rows_of("scaling", "--sizes", "quick", "--rounds", "1", folder=tmp_path)
     assert [(row["runner"], row["workers"], row["size"]) for row in rows] == [
@@ -66,7 +65,6 @@ def test_scaling(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.alone
 def test_sizing(tmp_path: Path) -> None:
     given = ("--presets", "ml10-quick", "--rounds", "1", "--workers", "1", "2", "1000")
     rows = rows_of("sizing", *given, folder=tmp_path)
@@ -81,7 +79,6 @@ def test_sizing(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.alone
 def test_tracking(tmp_path: Path) -> None:
     rows = rows_of("tracking", "--rounds", "1", "--iterations", "2", folder=tmp_path)
     assert [row["mlflow"] for row in rows] == ["no tracking", "down", "slow", "up (SQLite)", "no tracking, again"]
@@ -95,7 +92,6 @@ def test_tracking(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.alone
 @pytest.mark.timeout(1800)
 def test_faults(tmp_path: Path) -> None:
     found = rows_of("faults", "--kills", "5", "--seed", "1", "--folder", str(tmp_path / "campaign"), folder=tmp_path)

@@ -53,7 +53,6 @@ def test_a_job_succeeds_and_leaves_nothing_in_the_checkout(submit, workplace: Pa
 
 
 @pytest.mark.thorough
-@pytest.mark.alone  # Ray gives a stopped job three seconds
 def test_a_stopped_job_has_its_checkpoint_and_goes_on_to_the_same_bits(submit, job, train, wait_for, workplace: Path):
     endless = ("--training.iterations", "100000", "--training.checkpoint-every", "50000")
     submit("stopped", "meta_train", "--preset", "ml10-smoke", *endless, "--name", "job", wait=False)

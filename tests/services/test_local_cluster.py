@@ -55,6 +55,7 @@ def ended(processes: list[psutil.Process]) -> bool:
     return not any(process.is_running() and process.status() != psutil.STATUS_ZOMBIE for process in processes)
 
 
+@pytest.mark.thorough
 @pytest.mark.alone
 def test_a_cluster_takes_jobs_with_its_token_and_leaves_nothing_behind(started, programs, answers, wait_for):
     folder, printed = started

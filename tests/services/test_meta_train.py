@@ -133,6 +133,7 @@ def test_going_on_ends_with_the_same_bits(workplace: Path, train, mlflow_file: s
     assert episodes[0] == episodes[1], "also the checkpoint's digest"
 
 
+@pytest.mark.thorough
 def test_a_run_that_was_stopped_before_its_first_checkpoint_begins_anew(workplace: Path, train):
     undisturbed = train("whole", "--training.iterations", "3")
     train("other", "--training.iterations", "3")
@@ -189,7 +190,7 @@ def descendants(session: str) -> list[psutil.Process]:
         ("local", signal.SIGINT, 130),
         pytest.param("local", signal.SIGTERM, 143, marks=pytest.mark.thorough),
         pytest.param("ray", signal.SIGINT, 130, marks=[pytest.mark.thorough, pytest.mark.alone]),
-        pytest.param("ray", signal.SIGTERM, 143, marks=pytest.mark.alone),
+        pytest.param("ray", signal.SIGTERM, 143, marks=[pytest.mark.thorough, pytest.mark.alone]),
     ],
 )
 def test_a_stopped_run_goes_on_with_the_same_bits(

@@ -91,7 +91,6 @@ sys.exit(exit_code(meta_train.run, sys.argv[1:]))
 
 
 @pytest.mark.thorough
-@pytest.mark.alone
 def test_a_run_on_ray_listens_on_loopback_and_keeps_its_secrets_when_it_fails(
     workplace: Path, short_folder: Path, free_port, wait_for, monkeypatch
 ):
@@ -128,7 +127,6 @@ def test_a_run_on_ray_listens_on_loopback_and_keeps_its_secrets_when_it_fails(
 
 
 @pytest.mark.thorough
-@pytest.mark.alone
 def test_a_whole_run_keeps_its_secrets(programs, train, workplace: Path, monkeypatch):
     planted = secrets.token_hex(32)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{workplace / 'store.db'}")

@@ -112,7 +112,6 @@ def postgres(network: Network, wait_for: Callable[..., None]) -> Iterator[str]:
 
 
 @pytest.mark.thorough
-@pytest.mark.alone
 def test_a_job_on_two_raylets_becomes_a_finished_run_of_mlflow_on_postgres(
     network: Network, postgres: str, store, workplace: Path, wait_for: Callable[..., None]
 ):

@@ -171,6 +171,7 @@ def test_a_hung_actor_is_overtaken(make, monkeypatch: pytest.MonkeyPatch, caplog
         pool.close()
 
 
+@pytest.mark.thorough
 def test_where_the_slow_actor_is_first_its_answer_counts(
     make, counter: WorkerCounter, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -64,7 +64,6 @@ def test_a_lost_learner_changes_nothing(small: Experiment, data, how: int, monke
 
 
 @pytest.mark.thorough
-@pytest.mark.alone
 @pytest.mark.usefixtures("joined")
 def test_what_was_done_since_the_last_state_is_done_again(small: Experiment, data):
     wanted = alone(small, data)
@@ -107,6 +106,7 @@ def test_a_hung_worker_is_overtaken_and_the_log_says_so(
     assert "a backup runs it too" in caplog.text
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("joined")
 def test_a_slot_that_ends_its_workers_is_named(small: Experiment, data):
     class Deadly(Dmil):
@@ -133,7 +133,6 @@ def test_a_slot_that_ends_its_workers_is_named(small: Experiment, data):
 
 
 @pytest.mark.thorough
-@pytest.mark.alone
 @pytest.mark.usefixtures("joined")
 def test_a_trial_that_ends_its_workers_is_named(
     train, workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -168,7 +167,6 @@ def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[Nodes]:
 
 
 @pytest.mark.thorough
-@pytest.mark.alone
 @pytest.mark.parametrize("asked", [None, 4])
 def test_nodes_may_leave_and_join(
     config: ExperimentConfig, store: DemoStore, data, nodes: Nodes, wait_for, asked: int | None
@@ -331,6 +329,7 @@ def test_numbers_that_are_not_finite_stop_a_run_before_the_step(train, capsys: p
     assert f"iteration {iteration}: a loss or a gradient is not finite" in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("nonfinite")
 def test_a_run_may_go_on_without_the_steps_that_are_not_finite(train, capsys: pytest.CaptureFixture[str]):
     finished = train("run", "--training.iterations", "20", "--on-nonfinite", "skip")
@@ -367,6 +366,7 @@ def test_a_collapse_is_told_once_when_it_has_lasted():
 # Evaluations on the way
 
 
+@pytest.mark.thorough
 def test_evaluations_that_were_dropped_are_made_up(train, workplace: Path):
     schedule = ("--training.checkpoint-every", "2", "--evaluation.every", "2")
     train("run", "--training.iterations", "6", *schedule)

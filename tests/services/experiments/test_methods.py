@@ -48,10 +48,7 @@ def smoke(method: str, iterations: int) -> ExperimentConfig:
 @pytest.mark.usefixtures("joined")
 @pytest.mark.parametrize(
     "method",
-    [
-        method if method in ("dmil", "option-gail", "mlsh") else pytest.param(method, marks=pytest.mark.thorough)
-        for method in LEARNERS
-    ],
+    [method if method == "option-gail" else pytest.param(method, marks=pytest.mark.thorough) for method in LEARNERS],
 )
 def test_here_and_on_workers_that_are_killed_the_same_bits_come_out(store: DemoStore, data, method: str):
     experiment = Experiment(smoke(method, 4), store)

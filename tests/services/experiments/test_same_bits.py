@@ -19,6 +19,8 @@ from tests.services.experiments.same_bits import METHODS, RUNS, processor, train
 
 KNOWN = json.loads(Path(__file__).with_name("same_bits.json").read_text())
 OLD = Path(__file__).with_name("old_checkpoints")
+QUICK = [f"{method}-0" for method in METHODS]
+"""The runs of `make test`: one of each method."""
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +42,8 @@ def finished(runs: Path, method: str) -> Checkpoint:
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.thorough) if name.endswith("-1") else name for name in RUNS]
+    "name",
+    [name if name in QUICK else pytest.param(name, marks=pytest.mark.thorough) for name in RUNS],
 )
 def test_a_run_comes_to_the_same_bits_as_ever(runs: Path, name: str):
     digests = train(name, runs)
@@ -63,13 +66,10 @@ def test_a_run_of_each_method_comes_to_its_table(runs: Path, method: str):
         assert whole.manifest.iteration == 0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "method",
-    [
-        method if method in ("option-gail", "mlsh") else pytest.param(method, marks=pytest.mark.thorough)
-        for method, kind in OURS.items()
-        if issubclass(kind, MetaLearner)
-    ],
+    [method for method, kind in OURS.items() if issubclass(kind, MetaLearner)],
 )
 def test_a_run_that_is_resumed_comes_to_the_same_bits(runs: Path, workplace: Path, method: str):
     whole = finished(runs, method)

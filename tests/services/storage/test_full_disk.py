@@ -38,6 +38,7 @@ def fill(disk: Path, but: int) -> Path:
     return filler
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("left", [0, 20_000])
 def test_a_full_disk_stops_a_run_which_goes_on_when_there_is_space(
     train, small_disk: Path, left: int, capsys: pytest.CaptureFixture[str]

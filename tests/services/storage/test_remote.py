@@ -40,7 +40,7 @@ def server(free_port: Callable[[], int], answers, wait_for, tmp_path_factory) ->
     process.wait()
 
 
-@pytest.fixture(params=["file", "s3"])
+@pytest.fixture(params=[pytest.param("file", marks=pytest.mark.thorough), "s3"])
 def url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A storage of each kind, which programs are told of too."""
     if request.param == "file":
@@ -98,6 +98,7 @@ def test_a_run_goes_on_elsewhere_to_the_same_bits(url: str, train, workplace: Pa
     assert summary == (workplace / "runs" / "run" / "summary.json").read_bytes()
 
 
+@pytest.mark.thorough
 def test_a_run_whose_folder_is_as_far_is_left_alone(url: str, train, workplace: Path, capsys):
     train("run", "--training.iterations", "2")
     capsys.readouterr()
@@ -123,7 +124,7 @@ Replica(Path(sys.argv[1]), Dying(sys.argv[2])).copy()
 """
 
 
-@pytest.mark.parametrize("parts", [0, 1, 4, 5, 7, 9])
+@pytest.mark.parametrize("parts", [0, *(pytest.param(parts, marks=pytest.mark.thorough) for parts in (1, 4, 5, 9)), 7])
 def test_killed_between_parts_it_leaves_whole_checkpoints_only(
     url: str, shared_run, workplace: Path, monkeypatch, parts: int
 ):

@@ -99,7 +99,6 @@ def slow_server() -> Iterator[tuple[str, threading.Event]]:
 
 
 @pytest.mark.thorough
-@pytest.mark.alone
 def test_a_slow_server_is_not_waited_for(
     slow_server: tuple[str, threading.Event], tmp_path: Path, mlflow_file: str, monkeypatch
 ):
@@ -156,7 +155,6 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
 
 
 @pytest.mark.thorough
-@pytest.mark.alone
 def test_a_server_takes_records_also_those_of_the_time_it_was_away(server: Server, tmp_path: Path, wait_for, logged):
     folder = tmp_path / "run"
     folder.mkdir()

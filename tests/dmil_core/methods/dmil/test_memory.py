@@ -32,12 +32,10 @@ def megabytes(program: str) -> float:
 
 
 @pytest.mark.thorough
-@pytest.mark.alone
 def test_a_task_of_paper_size_with_ten_sub_skills_stays_under_one_and_a_half_gigabytes() -> None:
     assert megabytes(PEAK) < 1500
 
 
 @pytest.mark.thorough
-@pytest.mark.alone
 def test_memory_is_flat_over_500_iterations() -> None:
     assert megabytes(GROWTH) < 8
