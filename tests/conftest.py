@@ -3,6 +3,8 @@
 import os
 import secrets
 
+import pytest
+
 # Ray reads these when it is first imported, after this file, here and in every program that a test starts.
 os.environ |= {
     "RAY_AUTH_MODE": "token",
@@ -19,3 +21,13 @@ for _name in (
     "COLUMNS", "LINES", "FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE",
 ):  # fmt: skip
     os.environ.pop(_name, None)
+
+LONGEST = (
+    "test_tune_configs.py", "test_tune_sweep.py", "test_same_bits.py", "test_faults.py", "test_runner.py",
+    "test_programs.py", "test_remote.py", "test_meta_train.py", "test_jobs.py",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the files that take longest first: one that begins last would keep one process busy and the other idle."""
+    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))

@@ -1,4 +1,7 @@
-"""Each sweep in tune_configs, at preset smoke, as a user runs it: real Tune, real MLflow."""
+"""Sweeps of tune_configs, at preset smoke, as a user runs them: real Tune, real MLflow.
+
+Those that are not run here vary one setting, as `em` does; `test_settings` plans the trials of all.
+"""
 
 import json
 from collections.abc import Callable
@@ -11,10 +14,10 @@ from mlflow.entities import Run
 
 from services import tune_sweep
 from services.sweeps.folders import SweepFolder
+from tests.services.sweeps.test_settings import NAMES
 
 ROWS = {
     "bilevel": ["DMIL", "DMIL-High", "DMIL-Low", "OptionGAIL"],
-    "continuity": ["DMIL_nc", "λ = 0.01", "DMIL", "λ = 1"],
     "em": ["DMIL", "DMIL_soft"],
     "finetune_steps": ["10", "30", "50", "100", "300", "500"],
     "kitchen_k": ["K=2", "K=4", "K=8"],
@@ -29,13 +32,8 @@ ROWS = {
         "per task",
         "nearest neighbour",
     ],
-    "negatives": ["same", "mismatched"],
-    "sub_skills": ["K=2", "K=3", "K=5", "K=8", "K=10"],
 }
-WITHOUT_PAPER = ("continuity", "methods", "negatives", "sub_skills")
-"""Sweeps with rows, or all of them, that the paper does not have."""
-
-FLAT = {"MIL", "PEMIRL", "same", "mismatched", "behaviour cloning", "per task", "nearest neighbour"}
+FLAT = {"MIL", "PEMIRL", "behaviour cloning", "per task", "nearest neighbour"}
 """Rows of methods without sub-skills."""
 
 
@@ -74,8 +72,7 @@ def test_each_sweep_ends_with_its_table(sweep, mlflow_file: str, name: str) -> N
     assert {"tables/report.html", "tables/table.png"} <= set(artifacts)
     assert list(dict.fromkeys(cell["row"] for cell in tables["cells"])) == ROWS[name]
     assert all(cell["episodes"] and cell["seeds"] == [0] for cell in tables["cells"])
-    papers = [cell["paper"] for cell in tables["cells"]]
-    assert all(papers) if name not in WITHOUT_PAPER else name == "continuity" or not any(papers)
+    assert all(bool(cell["paper"]) == (name != "methods") for cell in tables["cells"])
     assert parent.info.status == "FINISHED"
     assert tables["what"] in parent.data.tags["mlflow.note.content"]
     assert len(children) == sum(tables["trials"].values())
@@ -112,6 +109,6 @@ def test_help_lists_the_sweeps(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         tune_sweep.run(["--help"])
     printed = capsys.readouterr().out
-    for name in (*ROWS, "search"):
+    for name in NAMES:
         assert f"  {name} " in printed
     assert "(Table 4)" in printed
