@@ -204,7 +204,7 @@ def preset_of(suite: str, preset: str, method: str = DEFAULT_METHOD) -> Experime
 
     Raises:
         KeyError: for an unknown preset.
-        MethodError: for an unknown method.
+        UserError: for an unknown method.
     """
     config, own = BASE_PRESETS[preset], config_type(method)
     changes: dict[str, dict[str, Any]] = {"method": {"name": method}, "suite": {"name": suite}}

@@ -17,7 +17,6 @@ from dmil_core.configs import (
     preset_of,
 )
 from dmil_core.errors import UserError, explain, shown
-from dmil_core.methods.registry import MethodError
 from services.cli.yaml_files import merged, read_yaml
 
 DEFAULT_SUITE, DEFAULT_PRESET = "ml10", "quick"
@@ -59,7 +58,7 @@ def config_from(
         settings = preset_of(suite or named or DEFAULT_SUITE, size, method or method_named(given)).model_dump()
     except ValidationError as error:
         raise _no_name(suite) from error
-    except MethodError as error:
+    except UserError as error:
         raise UserError(str(error) if file is None or method is not None else f"{file}: {error}") from error
     settings = merged(settings, given, str(file))
     if method is not None:

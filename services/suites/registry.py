@@ -1,20 +1,21 @@
 """Suites by name: our own, and those that installed packages bring."""
 
 import re
-import traceback
 from collections.abc import Callable
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
-from pathlib import Path
+from typing import Any
 
 from dmil_core.configs import SuiteConfig
 from dmil_core.errors import UserError
+from dmil_core.plug_ins import imported, plug_ins, raised
 from services.suites.base import TaskSuite
 
 ENTRY_POINTS = "dmil.suites"
 """The group of entry points in which a package registers what makes a suite from a `SuiteConfig`."""
 OURS = {"kitchen": "services.suites.kitchen:KitchenSuite", "": "services.suites.metaworld:MetaWorldSuite"}
 """By what names begin with; each simulator is imported only where it is used."""
+OUR_NAMES = re.compile(r"ml(10|10-reference|45|1-.*)|push-around-wall|kitchen(-.*)?", re.IGNORECASE)
+"""Names that no package's suite may have, known before any simulator is imported."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 """Of a family and of a task."""
 ATTRIBUTES: dict[str, type] = {
@@ -47,31 +48,14 @@ def open_suite(config: SuiteConfig) -> TaskSuite:
         raise
 
 
-def _registered() -> dict[str, EntryPoint]:
-    """Return the suites of installed packages by name.
-
-    Raises:
-        UserError: if two packages register one name.
-    """
-    found: dict[str, EntryPoint] = {}
-    for point in entry_points(group=ENTRY_POINTS):
-        if (other := found.setdefault(point.name, point)).value != point.value:
-            raise UserError(
-                f"entry points {ENTRY_POINTS}: got {point.name} twice, {other.value} and {point.value}; wanted one "
-                "package for each name; uninstall either"
-            )
-    return found
+def _registered() -> dict[str, Any]:
+    """Return the entry points of installed packages' suites by name."""
+    return plug_ins(ENTRY_POINTS, lambda name: "a suite of our own" if OUR_NAMES.fullmatch(name) else None)
 
 
-def _plugged_in(point: EntryPoint, config: SuiteConfig) -> TaskSuite:
+def _plugged_in(point: Any, config: SuiteConfig) -> TaskSuite:
+    make: Callable[[SuiteConfig], TaskSuite] = imported(point, "suite.name")
     where = f"suite.name: got {config.name}, {point.value}"
-    try:
-        make: Callable[[SuiteConfig], TaskSuite] = point.load()
-    except Exception as error:  # importing a package runs its code, which may raise anything
-        raise UserError(
-            f"{where}, which cannot be imported: {_told(error)}; wanted what the entry point names; mend its package, "
-            "or install it again"
-        ) from error
     suite = _made(make, config, where)
     _check_attributes(suite, where)
     _check_settings(make, suite, config, where)
@@ -81,11 +65,11 @@ def _plugged_in(point: EntryPoint, config: SuiteConfig) -> TaskSuite:
 def _made(make: Callable[[SuiteConfig], TaskSuite], config: SuiteConfig, where: str) -> TaskSuite:
     try:
         return make(config)
-    except UserError:
+    except (UserError, KeyboardInterrupt):
         raise
-    except Exception as error:
+    except BaseException as error:  # a package's code may raise anything, SystemExit too
         raise UserError(
-            f"{where}: got {_told(error)}; wanted a suite for {config!r}, or a UserError that says what it cannot do"
+            f"{where}: got {raised(error)}; wanted a suite for {config!r}, or a UserError that says what it cannot do"
         ) from error
 
 
@@ -133,10 +117,3 @@ def _check_settings(
                 f"suite.{field}: got {given!r}; without it {suite.name} has the same protocol, {suite.protocol!r}; "
                 "leave it out, or, if the suite heeds it, name it in its protocol"
             )
-
-
-def _told(error: Exception) -> str:
-    """Return an error in a package's code in words, with the line it comes from."""
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if "importlib" not in frame.filename]
-    told, last = f"{type(error).__name__}: {error}", frames[-1]
-    return told if last.filename == __file__ else f"{told} ({Path(last.filename).name}, line {last.lineno})"

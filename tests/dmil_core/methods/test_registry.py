@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from dmil_core.errors import UserError
 from dmil_core.methods.mil.config import MilConfig
 from dmil_core.methods.nearest_neighbour.config import NearestNeighbourConfig
-from dmil_core.methods.registry import OURS, MethodError, config_type, method_names, method_type
+from dmil_core.methods.registry import OURS, config_type, method_names, method_type
 
 NEAREST = "from dmil_core.methods.nearest_neighbour.method import NearestNeighbour as Nearest"
 
@@ -41,7 +42,18 @@ def test_methods_of_packages_stand_behind_ours(install) -> None:
 @pytest.mark.parametrize(
     ("code", "said"),
     [
-        ("import nowhere", "which cannot be imported: ModuleNotFoundError: No module named 'nowhere'; wanted what the"),
+        (
+            "import nowhere",
+            "which cannot be imported: ModuleNotFoundError: No module named 'nowhere' (faulty_package.py, ",
+        ),
+        (
+            "import sys\nsys.exit()",
+            "which cannot be imported: SystemExit:  (faulty_package.py, line 2); wanted what the",
+        ),
+        (
+            "class Out(BaseException): ...\nraise Out",
+            "which cannot be imported: Out:  (faulty_package.py, line 2); wanted",
+        ),
         ("", "which cannot be imported: AttributeError: module 'faulty_package' has no attribute 'Nearest'; wanted"),
         ("Nearest = 3", "got 3; wanted a class derived from Method; see docs/your-own-method.md"),
         ("class Nearest: ...", "wanted a class derived from Method"),
@@ -49,7 +61,7 @@ def test_methods_of_packages_stand_behind_ours(install) -> None:
 )
 def test_a_fault_of_a_package_is_told_in_words(install, code: str, said: str) -> None:
     install("nearest", "faulty_package", code)
-    with pytest.raises(MethodError, match=r"method\.name: got nearest, faulty_package:Nearest") as caught:
+    with pytest.raises(UserError, match=r"method\.name: got nearest, faulty_package:Nearest") as caught:
         method_type("nearest")
     assert said in str(caught.value)
 
@@ -57,7 +69,7 @@ def test_a_fault_of_a_package_is_told_in_words(install, code: str, said: str) ->
 @pytest.mark.parametrize("name", ["foo", 3, ["dmil"]])
 def test_what_names_no_method_is_told_with_all_that_there_are(install, name: object) -> None:
     install("nearest", "one_package")
-    with pytest.raises(MethodError, match=r"method.name: got .*; wanted one of dmil, .*, nearest$"):
+    with pytest.raises(UserError, match=r"method.name: got .*; wanted one of dmil, .*, nearest$"):
         method_type(name)
 
 
@@ -66,7 +78,7 @@ def test_two_packages_of_one_name_are_told_apart(install, asked: str) -> None:
     install("nearest", "one_package")
     install("nearest", "another_package")
     with pytest.raises(
-        MethodError, match=r"entry points dmil\.methods: got nearest twice, .*; uninstall either"
+        UserError, match=r"entry points dmil\.methods: got nearest twice, .*; uninstall either"
     ) as caught:
         method_type(asked)
     for both in ("one_package:Nearest", "another_package:Nearest"):
@@ -76,10 +88,10 @@ def test_two_packages_of_one_name_are_told_apart(install, asked: str) -> None:
 @pytest.mark.parametrize("asked", ["mil", "dmil", "foo"])
 def test_a_package_s_method_does_not_pass_for_one_of_ours(install, asked: str) -> None:
     install("mil", "one_package")
-    with pytest.raises(MethodError) as caught:
+    with pytest.raises(UserError) as caught:
         method_type(asked)
     assert str(caught.value) == (
-        "entry points dmil.methods: got mil twice, our own dmil_core.methods.mil.method:Mil and one_package:Nearest; "
-        "wanted another name than any of ours; rename the package's, or uninstall it"
+        "entry points dmil.methods: got mil twice, our own dmil_core.methods.mil.method:Mil and one_package:Nearest of "
+        "the package one_package; wanted another name than any of ours; rename the package's, or uninstall it"
     )
     assert config_type("mil") is MilConfig

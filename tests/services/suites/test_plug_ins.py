@@ -19,7 +19,8 @@ from services.cli.arguments import exit_code
 from services.demonstrations.store import DemoStore
 from services.evaluation.results import EpisodeResult, read_rows
 from services.storage.checkpoints import Checkpoints
-from services.suites.registry import open_suite
+from services.suites import kitchen, metaworld
+from services.suites.registry import OUR_NAMES, open_suite
 
 PROJECT = Path(__file__).parents[3]
 EXAMPLE = PROJECT / "docs" / "examples" / "planar_visits"
@@ -153,6 +154,14 @@ def test_the_experts_do_their_tasks_and_every_visit_counts_in_turn():
 FAULTS = {
     "imports nothing": ("import nowhere", "cannot be imported: ModuleNotFoundError: No module named 'nowhere' (more_"),
     "no such name": ("", "cannot be imported: AttributeError: module 'more_tasks' has no attribute 'Faulty'; wanted"),
+    "ends": (
+        "raise SystemExit(0)",
+        "more_tasks:Faulty of the package more, which cannot be imported: SystemExit: 0 (mo",
+    ),
+    "ends later": (
+        faulty("def __init__(self, config):", "    raise SystemExit"),
+        "more_tasks:Faulty: got SystemExit:  (more_tasks.py, line 4); wanted",
+    ),
     "no Python": ("class", "cannot be imported: SyntaxError: invalid syntax (more_tasks.py, line 1); wanted"),
     "raises": (
         faulty("def __init__(self, config):", "    {}['x']"),
@@ -200,6 +209,19 @@ def test_two_packages_of_one_name_are_told_apart(register, complaint):
     assert "got planar-visits twice" in printed
     assert "planar_visits:PlanarVisits" in printed
     assert "more_tasks:Faulty" in printed
+
+
+@pytest.mark.parametrize("name", ["ML45", "ML1-reach", "kitchen", "push-around-wall"])
+def test_a_package_s_suite_does_not_pass_for_one_of_ours(register, complaint, name: str):
+    register(faulty("pass"), name)
+    printed = complaint(meta_train.run, *SMOKE)  # whatever is asked for
+    assert (
+        f"error: entry points dmil.suites: got {name} twice, a suite of our own and more_tasks:Faulty of the" in printed
+    )
+
+
+def test_our_suites_names_are_kept_for_them():
+    assert [name for name in (*metaworld.SPLITS, *kitchen.SPLITS) if not OUR_NAMES.fullmatch(name)] == []
 
 
 MISTAKES = {
