@@ -16,12 +16,15 @@ from services.suites.base import Environment, Expert
 
 
 class _Recorder:
-    """Resets an environment, and records all steps of the episode that begins."""
+    """Resets an environment, and records all steps of the episode that begins.
+
+    What an environment, an expert or a policy hands over is copied: it may be a buffer that the next step overwrites.
+    """
 
     def __init__(self, env: Environment, seed: int) -> None:
         self._env, self._seed = env, seed
         self.observation, self.info = env.reset(seed=seed)
-        self._goal: list[float] = self.info.get("goal", [])
+        self._goal: list[float] = np.array(self.info.get("goal", []), np.float64).ravel().tolist()
         self.observations = [self.observation.astype(np.float32)]
         self.actions: list[np.ndarray] = []
         self.sub_skills: list[int] = []
@@ -38,7 +41,7 @@ class _Recorder:
             self.solved_at = len(self.actions)
         self._score = max(self._score, int(self.info.get("score", self.info["success"])))
         self.observations.append(self.observation.astype(np.float32))
-        self.actions.append(recorded)
+        self.actions.append(recorded.copy())
 
     def act(self, action: np.ndarray, sub_skill: int) -> None:
         """Execute what a policy chose, unless it is not finite: then the episode is over."""

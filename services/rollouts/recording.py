@@ -49,7 +49,7 @@ class _RecordingWrapper(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np
     def __init__(self, env: Environment, video: VideoSettings | None) -> None:
         super().__init__(env)
         self._video, self._camera = video, None
-        self._infos: list[Mapping[str, Any]] = []
+        self._infos: list[Mapping[str, float]] = []
         self._frames: list[Frame] = []
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
@@ -62,7 +62,7 @@ class _RecordingWrapper(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, SupportsFloat, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._infos.append(info)
+        self._infos.append({name: float(value) for name, value in info.items() if _is_number(value)})
         if self._video is not None and len(self._infos) % self._video.every == 0:
             self._draw()
         return observation, reward, terminated, truncated, info
@@ -76,8 +76,8 @@ class _RecordingWrapper(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np
         if self._frames and self._frames[-1].step < len(self._infos):
             self._draw()
         first = self._infos[0] if self._infos else {}
-        names = [name for name in first if all(_is_number(info.get(name)) for info in self._infos)]
-        infos = {name: np.array([float(info[name]) for info in self._infos]) for name in names}
+        names = [name for name in first if all(name in info for info in self._infos)]
+        infos = {name: np.array([info[name] for info in self._infos]) for name in names}
         return Recording(infos, self._frames)
 
     def close_camera(self) -> None:

@@ -1,15 +1,19 @@
 """Episodes: what the expert's demonstrations hold, and that episodes in lockstep are the single ones."""
 
 from collections.abc import Callable
+from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.spaces import Box
 
 from dmil_core.configs import DemonstrationConfig, EvaluationConfig, SuiteConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import Decision, Policy
 from services.rollouts.adaptations import EpisodeOutcome, imitation_error, plan_adaptations
 from services.rollouts.episodes import collect_rollouts, demonstrate, rollout
+from services.rollouts.recording import record_rollouts
 from services.suites.base import Environment, Expert
 from services.suites.metaworld import MetaWorldSuite
 
@@ -209,3 +213,47 @@ def test_a_rollout_holds_what_the_policy_saw_and_is_cut_off_at_the_limit(suite, 
         assert (episode.ended, part.ended, len(part)) == (True, False, 3)
         assert np.array_equal(episode.observations[:4], part.observations)
         assert np.array_equal(episode.sub_skills[:3], part.sub_skills)
+
+
+class OneBuffer(gymnasium.Env[np.ndarray, np.ndarray]):
+    """Counts its steps, and returns the same arrays and dictionaries all the time."""
+
+    observation_space, action_space = Box(-9, 9, (2,), np.float32), Box(-1, 1, (1,), np.float32)
+
+    def __init__(self) -> None:
+        self._state, self._goal = np.zeros(2, np.float32), np.zeros(1)
+        self._info: dict[str, Any] = {"success": False, "goal": self._goal, "steps": np.int64(0)}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        self._state[:], self._goal[:], self._info["steps"] = 0, seed, np.int64(0)
+        return self._state, self._info
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self._state += 1
+        self._goal -= 1
+        self._info["steps"] += 1
+        return self._state, 0.0, False, False, self._info
+
+
+class OneAction(Policy):
+    """Acts by what it sees, in the same array all the time; an expert too."""
+
+    def __init__(self) -> None:
+        self._actions = np.zeros((1, 1), np.float32)
+
+    def act(self, observations: np.ndarray, memory: np.ndarray) -> Decision:
+        return Decision(self.get_action(observations[0])[None], np.zeros(1, np.int64), memory)
+
+    def get_action(self, obs: np.ndarray, /) -> np.ndarray:
+        self._actions[:] = obs[0] / 8
+        return self._actions[0]
+
+
+def test_what_comes_by_reference_is_copied():
+    (acted, recording), *_ = record_rollouts(OneAction(), [OneBuffer()], [7], 4, {})
+    shown = demonstrate(OneAction(), OneBuffer(), 7, 4, DemonstrationConfig(noise=0))
+    for episode in (acted, shown):
+        assert episode.observations.tolist() == [[step, step] for step in range(5)]
+        assert episode.actions.tolist() == [[0], [0.125], [0.25], [0.375]]
+        assert episode.goal == [7]
+    assert recording.infos["steps"].tolist() == [1, 2, 3, 4]
