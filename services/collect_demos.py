@@ -19,8 +19,9 @@ from dmil_core.configs import ExperimentConfig
 from services import inspect_demos, record_demos, verify_experts
 from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import DEFAULT_PRESET, EARLY, defaults_from
+from services.cli.places import announce
 from services.cli.progress import Clock, console
-from services.demonstrations.store import TaskDemonstrations, open_store
+from services.demonstrations.store import DATA, TaskDemonstrations, open_store
 from services.distributed.ray_runner import RunnerKind, open_runner
 from services.experiments.experiment import Experiment
 
@@ -55,6 +56,7 @@ def run(arguments: Sequence[str]) -> None:
         return
     given = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(peek(arguments, **EARLY))))
     store = open_store()
+    announce(demonstrations=(store.root, f"{DATA}=FOLDER"))
     experiment = Experiment(given.experiment, store)
     clock = Clock()
     with open_runner(given.runner, experiment.suite, given.workers) as runner:

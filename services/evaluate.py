@@ -14,8 +14,9 @@ from dmil_core.configs import EvaluationConfig
 from dmil_core.errors import UserError
 from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import with_evaluation
+from services.cli.places import announce
 from services.cli.progress import Clock, console
-from services.demonstrations.store import open_store
+from services.demonstrations.store import DATA, open_store
 from services.distributed.ray_runner import RunnerKind, open_runner
 from services.evaluation.summary import summarise
 from services.experiments.champions import ALIAS, open_contest
@@ -58,7 +59,8 @@ def run(arguments: Sequence[str]) -> None:
         if given.promote:
             raise UserError("--promote: got --tasks with it; wanted all of the suite's, by which models are compared")
         config = config.model_copy(update={"suite": config.suite.model_copy(update={"test_tasks": given.tasks})})
-    experiment = Experiment(config, open_store())
+    experiment = Experiment(config, store := open_store())
+    announce(evaluation=(given.output, "--output FOLDER"), demonstrations=(store.root, f"{DATA}=FOLDER"))
     given.output.mkdir(parents=True, exist_ok=True)
     contest = open_contest(checkpoint, experiment, given.output / ALIAS) if given.promote else None
     clock = Clock()

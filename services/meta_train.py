@@ -18,8 +18,9 @@ from dmil_core.configs import DEFAULT_METHOD, ExperimentConfig
 from dmil_core.errors import UserError, explain
 from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import DEFAULT_PRESET, EARLY, defaults_from
+from services.cli.places import announce
 from services.cli.progress import Clock, console
-from services.demonstrations.store import open_store
+from services.demonstrations.store import DATA, open_store
 from services.distributed.ray_runner import RunnerKind, open_runner
 from services.evaluation.summary import summarise
 from services.experiments.experiment import Experiment, OnNonfinite
@@ -31,6 +32,7 @@ from services.storage.redaction import redacted
 from services.storage.remote import STORAGE
 from services.storage.replication import replicated, restored
 from services.storage.run_folders import find_folder, new_folder
+from services.tracking.links import database
 from services.tracking.system import recording_system
 from services.tracking.tracker import Tracker, record_settings
 
@@ -86,12 +88,16 @@ def run(arguments: Sequence[str]) -> None:
 
 def _carry_out(given: Arguments, folder: Path, checkpoint: Checkpoint | None) -> None:
     config = given.experiment
-    experiment = Experiment(config, open_store())
+    experiment = Experiment(config, store := open_store())
+    announce(
+        run=(folder, "--runs FOLDER"),
+        demonstrations=(store.root, f"{DATA}=FOLDER"),
+        MLflow=(database(), "MLFLOW_TRACKING_URI=sqlite:///FILE"),
+    )
     checkpoints = Checkpoints(folder / "checkpoints", config.training.checkpoints_kept)
     clock = Clock()
     folder.mkdir(parents=True, exist_ok=True)
     write_file(folder / MARK, config.model_dump_json(indent=1) + "\n")
-    console.print(f"run: {folder}")
     tracker = Tracker(folder, f"dmil-{config.suite.name}")
     status = "FAILED"
     try:

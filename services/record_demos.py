@@ -13,9 +13,10 @@ from dmil_core.errors import UserError
 from dmil_core.trajectories import Episode
 from services.cli.arguments import exit_code, parse
 from services.cli.composition import suite_settings
+from services.cli.places import announce
 from services.cli.progress import console
 from services.demonstrations.external import FORMS, demonstrations
-from services.demonstrations.store import open_store
+from services.demonstrations.store import DATA, open_store
 from services.suites.registry import open_suite
 
 MOST = 10_000
@@ -39,9 +40,9 @@ def run(arguments: Sequence[str]) -> None:
     given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, tyro.MISSING, tyro.MISSING))
     if given.source.partition(":")[0] not in FORMS:
         raise UserError(f"--from: got {given.source}; wanted npz:PATH, hdf5:PATH or minari:ID")
-    suite = open_suite(suite_settings(given.suite, (given.task,)))
+    suite, store = open_suite(suite_settings(given.suite, (given.task,))), open_store()
+    announce(demonstrations=(store.root, f"{DATA}=FOLDER"))
     recorded = demonstrations(given.task, given.source, suite, MOST)
-    store = open_store()
     dataset_id = f"{suite.family}/{given.task}/recorded-{recorded.digest[:10]}-v2"
     saved = store.save(
         dataset_id,

@@ -17,9 +17,10 @@ from pydantic import ValidationError
 
 from dmil_core.errors import RunError, UserError, explain
 from services.cli.arguments import Quiet, exit_code, parse
+from services.cli.places import announce
 from services.cli.progress import Clock, console
 from services.cli.yaml_files import read_yaml
-from services.demonstrations.store import open_store
+from services.demonstrations.store import DATA, data_root, open_store
 from services.distributed.cluster import joined
 from services.distributed.ray_runner import open_runner
 from services.experiments.experiment import Experiment
@@ -29,8 +30,9 @@ from services.suites.registry import open_suite
 from services.sweeps.folders import MARK, SweepFolder, SweepRecord
 from services.sweeps.settings import Preset, Sweep, planned
 from services.sweeps.table_formats import publish, show, write_tables
-from services.tracking.delivery import IDENTITY, Identity
-from services.tracking.links import comparison_link, tracking_uri
+from services.tracking.delivery import Identity
+from services.tracking.links import comparison_link, database, tracking_uri
+from services.tracking.ownership import IDENTITY
 from services.tracking.system import recording_system
 from services.tracking.tracker import Tracker
 
@@ -74,7 +76,6 @@ def run(arguments: Sequence[str]) -> None:
     given = parse(Arguments, _description(), arguments, Arguments())
     sweep = _resumed(given) if given.resume is not None else _begun(given)
     clock = Clock()
-    console.print(f"sweep: {sweep.path}")
     tracker = Tracker(sweep.path, f"dmil-{sweep.record.name}")
     status = "FAILED"
     try:
@@ -143,6 +144,7 @@ def _begun(given: Arguments) -> SweepFolder:
         open_suite(trial.config.suite)
     name = given.name or f"{file.stem}-{given.preset}-{datetime.now():%Y%m%d-%H%M%S}"
     folder = new_folder(name, given.runs, MARK)
+    _announce(folder)
     record = SweepRecord(
         name=file.stem,
         preset=given.preset,
@@ -162,7 +164,17 @@ def _resumed(given: Arguments) -> SweepFolder:
             "--resume: got SWEEP, --suites, --seeds or --name with it; wanted none: a sweep goes on with its own"
         )
     assert given.resume is not None
-    return SweepFolder(find_folder(given.resume, given.runs, MARK))
+    folder = find_folder(given.resume, given.runs, MARK)
+    _announce(folder)
+    return SweepFolder(folder)
+
+
+def _announce(folder: Path) -> None:
+    announce(
+        sweep=(folder, "--runs FOLDER"),
+        demonstrations=(data_root(), f"{DATA}=FOLDER"),
+        MLflow=(database(), "MLFLOW_TRACKING_URI=sqlite:///FILE"),
+    )
 
 
 def _record_settings(tracker: Tracker, sweep: SweepFolder) -> None:

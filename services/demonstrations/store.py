@@ -36,6 +36,8 @@ from services.suites.base import TaskSuite
 
 logger = logging.getLogger(__name__)
 
+DATA = "DMIL_DATA"
+"""The environment variable that names the data root."""
 LIBRARIES = ("gymnasium", "gymnasium-robotics", "metaworld", "minari", "mujoco", "numpy")
 DIGESTS, ARRAYS, METADATA = "SHA256SUMS", "data/main_data.hdf5", "data/metadata.json"
 MOST_ARRAYS = 2**32
@@ -64,7 +66,7 @@ class _Metadata(BaseModel):
 
 def data_root() -> Path:
     """Return ``DMIL_DATA``, or ``data`` in the working directory."""
-    return Path(os.environ.get("DMIL_DATA") or "data")
+    return Path(os.environ.get(DATA) or "data")
 
 
 class DemoStore:

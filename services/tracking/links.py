@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote, urlsplit, urlunsplit
 
-DEFAULT_URI = "sqlite:///mlflow.db"
+SQLITE = "sqlite:///"
+DEFAULT_URI = f"{SQLITE}mlflow.db"
 PORT = 5000
 LOCAL = f"http://127.0.0.1:{PORT}"
 """Where ``services.tracking ui`` serves what is no server itself."""
@@ -19,6 +20,12 @@ TRAINING = "workflowType=machine_learning"
 def tracking_uri() -> str:
     """Return ``MLFLOW_TRACKING_URI``, or an SQLite file in the working directory."""
     return os.environ.get("MLFLOW_TRACKING_URI") or DEFAULT_URI
+
+
+def database() -> Path | None:
+    """Return the file that holds MLflow's records, unless MLflow is a server."""
+    uri = tracking_uri()
+    return Path(uri.removeprefix(SQLITE)) if uri.startswith(SQLITE) else None
 
 
 def run_link(uri: str, experiment_id: str, run_id: str) -> str:

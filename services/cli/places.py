@@ -1,0 +1,33 @@
+"""Where results will lie: told before the work begins, and refused where somebody else will delete them."""
+
+import re
+from pathlib import Path
+
+from dmil_core.errors import UserError
+from services.cli.progress import console
+
+RAY_FOLDER = re.compile(r"/(runtime_resources/\w+|session_\d{4}-\d\d-\d\d_[\d_-]+)(/|$)")
+"""What lies in it goes with its Ray cluster, or sooner: the packages of jobs, and a session's own files."""
+
+
+def announce(**places: tuple[Path | None, str]) -> None:
+    """Print where results will lie, as absolute paths.
+
+    Args:
+        places: by what lies there: a file or folder, or None for what is on no disk of this machine, and how to give
+            another, as ``--runs FOLDER`` or ``DMIL_DATA=FOLDER``.
+
+    Raises:
+        UserError: if one is in Ray's own folder, as in a job with ``--working-dir``; nothing is printed then.
+    """
+    found = {what: path.resolve() for what, (path, _) in places.items() if path is not None}
+    if passing := [what for what, path in found.items() if RAY_FOLDER.search(str(path))]:
+        got = "; ".join(f"{what}: got {found[what]}" for what in passing)
+        remedies = [places[what][1] for what in passing]
+        raise UserError(
+            f"{got}; Ray deletes that with its cluster; wanted what stays: give, with absolute paths, "
+            f"{' '.join(remedies)}; a job is given variables by ray job submit --runtime-env-json "
+            """'{"env_vars": {"NAME": "VALUE"}}'"""
+        )
+    for what, path in found.items():
+        console.print(f"{what}: {path}", markup=False, soft_wrap=True)
