@@ -32,7 +32,7 @@ from services.storage.redaction import redacted
 from services.storage.remote import STORAGE
 from services.storage.replication import replicated, restored
 from services.storage.run_folders import find_folder, new_folder
-from services.tracking.links import database
+from services.tracking.links import database, tracking_uri
 from services.tracking.system import recording_system
 from services.tracking.tracker import Tracker, record_settings
 
@@ -92,7 +92,7 @@ def _carry_out(given: Arguments, folder: Path, checkpoint: Checkpoint | None) ->
     announce(
         run=(folder, "--runs FOLDER"),
         demonstrations=(store.root, f"{DATA}=FOLDER"),
-        MLflow=(database(), "MLFLOW_TRACKING_URI=sqlite:///FILE"),
+        MLflow=(database(tracking_uri()), "MLFLOW_TRACKING_URI=sqlite:///FILE"),
     )
     checkpoints = Checkpoints(folder / "checkpoints", config.training.checkpoints_kept)
     clock = Clock()

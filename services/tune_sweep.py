@@ -173,7 +173,7 @@ def _announce(folder: Path) -> None:
     announce(
         sweep=(folder, "--runs FOLDER"),
         demonstrations=(data_root(), f"{DATA}=FOLDER"),
-        MLflow=(database(), "MLFLOW_TRACKING_URI=sqlite:///FILE"),
+        MLflow=(database(tracking_uri()), "MLFLOW_TRACKING_URI=sqlite:///FILE"),
     )
 
 

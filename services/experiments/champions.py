@@ -20,9 +20,10 @@ from services.storage.checkpoints import Checkpoint
 from services.storage.redaction import error_line, redacted
 from services.suites.registry import open_suite
 from services.tracking.client import connect
-from services.tracking.delivery import IDENTITY, Identity
+from services.tracking.delivery import Identity
 from services.tracking.links import tracking_uri
 from services.tracking.models import CHECKPOINT_TAG, checkpoint_in, models_of
+from services.tracking.ownership import IDENTITY, check_model
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -101,8 +102,10 @@ def _downloaded(client: "MlflowClient", version: "ModelVersion", uri: str, folde
 
     folder.mkdir(parents=True, exist_ok=True)
     # Not by its address: that is looked up at the process's MLflow, which may be another.
-    place = client.get_logged_model((version.source or "").removeprefix(_address(""))).artifact_location
-    return checkpoint_in(Path(download_artifacts(artifact_uri=place, dst_path=str(folder), tracking_uri=uri)))
+    model = client.get_logged_model((version.source or "").removeprefix(_address("")))
+    check_model(client, uri, model)
+    files = download_artifacts(artifact_uri=model.artifact_location, dst_path=str(folder), tracking_uri=uri)
+    return checkpoint_in(Path(files))
 
 
 @dataclass(frozen=True)

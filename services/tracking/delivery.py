@@ -15,14 +15,20 @@ from dmil_core.errors import RunError, UserError
 from services.storage.files import read_file, sync, write_file
 from services.tracking.client import connect, set_mlflow_defaults
 from services.tracking.links import artifacts_beside
+from services.tracking.ownership import (
+    FOLDER_TAG,
+    IDENTITY,
+    IDENTITY_BYTES,
+    RUN_TAG,
+    check_place,
+    check_run,
+)
 from services.tracking.sending import next_batch, send
 from services.tracking.spool import Line, read_spool
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-RUN_TAG = "dmil.run"
-"""The tag by which a run is found again whose id was never noted."""
 PARENT_TAG = "mlflow.parentRunId"
 """MLflow's own, by which its pages nest runs."""
 KIND = {"mlflow.experimentKind": "custom_model_development"}
@@ -33,9 +39,8 @@ OPENING_SECONDS = 20.0
 """A database has longer: on its first use MLflow makes its tables."""
 SENDING_SECONDS = 60.0
 """So have files."""
-IDENTITY = "mlflow_run.json"
-"""In a run's folder."""
-IDENTITY_BYTES = 10_000
+ID = "^[0-9a-f]{32}$"
+"""Of runs, MLflow's and our own alike: they stand in questions to MLflow."""
 
 
 class Identity(BaseModel):
@@ -43,15 +48,15 @@ class Identity(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    tag: str
+    tag: str = Field(pattern=ID)
     """Our own id of the run, known before MLflow is asked for its."""
     experiment: str
     name: str
     began: int
     """In milliseconds since 1970."""
-    parent: str | None = None
+    parent: str | None = Field(None, pattern=ID)
     """The tag of the run that this one is a trial of; it goes to the same MLflow experiment."""
-    run_id: str | None = Field(None, pattern="^[0-9a-f]{32}$")
+    run_id: str | None = Field(None, pattern=ID)
     experiment_id: str | None = Field(None, pattern="^[0-9]{1,32}$")
     """Noted with the run's, but not in files of older versions."""
     delivered: int = 0
@@ -103,6 +108,7 @@ class Delivery:
         self._folder, self._uri = folder, uri
         self._lock = FileLock(folder / "tracking.lock", thread_local=False)
         self._client: MlflowClient | None = None
+        self._checked = False
         self._usual = self._limit = SLOW_SECONDS if uri.startswith("http") else OPENING_SECONDS
         self._asked: float | None = None
         self._was_slow = False
@@ -189,10 +195,15 @@ class Delivery:
         if self._client is None:
             with self._asking():
                 self._client = connect(self._uri)
-        run_id = self.identity.run_id
+        run_id, experiment_id = self.identity.run_id, self.identity.experiment_id
         if run_id is None:
             experiment_id = self._experiment_in(self._client)
             run_id = self._run_in(self._client, experiment_id)
+        if not self._checked:
+            with self._asking():
+                check_run(self._client, self._uri, self._folder, run_id, self.identity.tag)
+            self._checked = True
+        if self.identity.run_id is None:
             self._note(run_id=run_id, experiment_id=experiment_id)
         return self._client, run_id
 
@@ -201,8 +212,9 @@ class Delivery:
         name = self.identity.experiment
         with self._asking():
             found = client.get_experiment_by_name(name)
-        if found:
-            return found.experiment_id
+            if found:
+                check_place(client, self._uri, found)
+                return found.experiment_id
         beside = artifacts_beside(self._uri)
         with self._asking():
             return client.create_experiment(name, artifact_location=beside and beside.as_uri(), tags=KIND)
@@ -212,7 +224,7 @@ class Delivery:
         identity = self.identity
         if (found := self._tagged(client, experiment_id, identity.tag)) is not None:
             return found
-        tags = {RUN_TAG: identity.tag}
+        tags = {RUN_TAG: identity.tag, FOLDER_TAG: str(self._folder.resolve())}
         if identity.parent is not None:
             parent = self._tagged(client, experiment_id, identity.parent)
             if parent is None:

@@ -22,9 +22,8 @@ def tracking_uri() -> str:
     return os.environ.get("MLFLOW_TRACKING_URI") or DEFAULT_URI
 
 
-def database() -> Path | None:
-    """Return the file that holds MLflow's records, unless MLflow is a server."""
-    uri = tracking_uri()
+def database(uri: str) -> Path | None:
+    """Return the file that holds the records of an MLflow that is a file."""
     return Path(uri.removeprefix(SQLITE)) if uri.startswith(SQLITE) else None
 
 
@@ -48,8 +47,8 @@ def how_to_look(uri: str) -> str | None:
 
 def artifacts_beside(uri: str) -> Path | None:
     """Return where artifacts go: beside an SQLite file, and else where the server says."""
-    path = Path(uri.removeprefix("sqlite:///"))
-    return path.resolve().parent / "mlartifacts" if uri.startswith("sqlite:///") else None
+    file = database(uri)
+    return None if file is None else file.resolve().parent / "mlartifacts"
 
 
 def _site(uri: str) -> str:

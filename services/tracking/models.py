@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from dmil_core.configs import EvaluationConfig
 from services.storage.checkpoints import Checkpoint
+from services.storage.files import inside
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -28,10 +29,14 @@ def models_of(client: "MlflowClient", run: "Run") -> "list[LoggedModel]":
 
 
 def checkpoint_in(model: Path) -> Path:
-    """Return the folder of the checkpoint in a model that was downloaded."""
+    """Return the folder of the checkpoint in a model that was downloaded.
+
+    Raises:
+        OSError: if the model says that it lies elsewhere.
+    """
     from mlflow.models import Model
 
-    return model / Model.load(str(model)).flavors["python_function"]["artifacts"]["checkpoint"]["path"]
+    return inside(model, Model.load(str(model)).flavors["python_function"]["artifacts"]["checkpoint"]["path"])
 
 
 def log_model(client: "MlflowClient", run_id: str, checkpoint: Checkpoint, example: dict[str, Any]) -> None:

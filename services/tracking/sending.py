@@ -16,6 +16,8 @@ T = TypeVar("T")
 METRICS_PER_CALL = 1000
 """What MLflow takes in one batch."""
 TEXTS_PER_CALL = 100
+LONGEST_NAME = 500
+"""Of a data set, in MLflow."""
 
 
 def next_batch(waiting: Sequence[Line]) -> Sequence[Line]:
@@ -50,7 +52,7 @@ def send(client: "MlflowClient", run_id: str, folder: Path, batch: Sequence[Line
         case "tags":
             _send_tags(client, run_id, value)
         case "inputs":
-            inputs = [DatasetInput(Dataset(name, sha[:32], "local", name), []) for name, sha in value.items()]
+            inputs = [DatasetInput(Dataset(_cut(name), sha[:32], "local", name), []) for name, sha in value.items()]
             client.log_inputs(run_id, datasets=inputs)
         case "artifact":
             _send_artifact(client, run_id, folder, value)
@@ -93,6 +95,11 @@ def _send_model(client: "MlflowClient", run_id: str, folder: Path, value: Traine
         _send_tags(client, run_id, {f"missing.{value.checkpoint}": str(error)[:5000]})
     else:
         log_model(client, run_id, checkpoint, value.example.model_dump())
+
+
+def _cut(name: str) -> str:
+    """Return a name of a data set, which may be a path, as long as MLflow has it."""
+    return name if len(name) <= LONGEST_NAME else f"{name[:20]}...{name[23 - LONGEST_NAME :]}"
 
 
 def _parts(items: list[T], size: int) -> Iterator[list[T]]:

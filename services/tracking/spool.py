@@ -14,6 +14,8 @@ from dmil_core.errors import UserError
 from services.storage.files import room_for
 
 LONGEST_LINE = 2**22
+NOTE = "mlflow.note.content"
+"""The one tag of MLflow's own that a run sets in a record: what its page shows. Others name, nest and move runs."""
 
 
 class _Content(BaseModel):
@@ -46,7 +48,7 @@ class Artifact(_Content):
     """A file or folder of the run: only such are ever sent, whatever the file of records says."""
 
     path: Annotated[str, AfterValidator(_below)]
-    folder: str | None
+    folder: Annotated[str, AfterValidator(_below)] | None
     """Where it goes among the run's artifacts."""
 
 
@@ -64,11 +66,18 @@ class Trained(_Content):
     example: Example
 
 
+def _ours(tags: dict[str, str]) -> dict[str, str]:
+    if strange := [name for name in tags if name.startswith(("mlflow.", "dmil.")) and name != NOTE]:
+        raise ValueError(f"wanted none of MLflow's own tags: {strange[0]}")
+    return tags
+
+
 Texts = dict[str, str]
 _RECORD: TypeAdapter[tuple[str, Any]] = TypeAdapter(
     tuple[Literal["begin"], None]
     | tuple[Literal["metrics", "system"], Measured]
-    | tuple[Literal["parameters", "tags", "inputs"], Texts]
+    | tuple[Literal["parameters", "inputs"], Texts]
+    | tuple[Literal["tags"], Annotated[Texts, AfterValidator(_ours)]]
     | tuple[Literal["artifact"], Artifact]
     | tuple[Literal["model"], Trained]
     | tuple[Literal["end"], Ended]

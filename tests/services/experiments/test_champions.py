@@ -14,7 +14,7 @@ from services.demonstrations.store import DemoStore
 from services.evaluation.comparison import Difference
 from services.experiments.champions import is_better
 from services.tracking.__main__ import run as tracking_program
-from services.tracking.delivery import IDENTITY
+from services.tracking.ownership import IDENTITY
 from tests.services.conftest import Server
 
 NAME = "ml10-part"

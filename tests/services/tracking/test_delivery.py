@@ -9,7 +9,8 @@ import pytest
 from mlflow import MlflowClient
 
 from dmil_core.errors import UserError
-from services.tracking.delivery import RUN_TAG, Delivery, Identity
+from services.tracking.delivery import Delivery, Identity
+from services.tracking.ownership import RUN_TAG
 from services.tracking.tracker import Tracker
 from tests.services.tracking.conftest import steps
 
@@ -108,6 +109,21 @@ def test_more_delivered_than_there_is_is_refused(tmp_path: Path):
     (tmp_path / "tracking.jsonl").write_text('["tags", {}]\n')
     with pytest.raises(UserError, match="got 2 records delivered; wanted at most the 1 of"):
         Delivery(tmp_path, "sqlite://")
+
+
+@pytest.mark.usefixtures("no_mlflow")
+def test_a_data_set_s_name_is_cut_to_what_mlflow_takes(tmp_path: Path, mlflow_file: str):
+    tracker = Tracker(tmp_path, "an experiment")
+    names = [f"hdf5:/{'deep/' * 120}{task}.hdf5" for task in ("reach", "push")]
+    tracker.inputs(dict.fromkeys(names, "0" * 64))
+    tracker.close("FINISHED")
+    delivery = Delivery(tmp_path, mlflow_file)
+    delivery.deliver()
+    delivery.close()
+    run = MlflowClient(mlflow_file).get_run(str(delivery.identity.run_id))
+    assert run.inputs is not None
+    found = {given.dataset.name for given in run.inputs.dataset_inputs}
+    assert {(name[:6], name[-10:], len(name)) for name in found} == {("hdf5:/", name[-10:], 500) for name in names}
 
 
 @pytest.mark.usefixtures("no_mlflow")

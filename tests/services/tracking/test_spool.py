@@ -14,7 +14,18 @@ from services.tracking.tracker import Tracker
 from tests.services.tracking.conftest import records
 
 
-@pytest.mark.parametrize("line", ["no JSON", "[]", '["metrics", {"step": 1}]', '["artifact", {"path": "/etc/passwd"}]'])
+@pytest.mark.parametrize(
+    "line",
+    [
+        "no JSON",
+        "[]",
+        '["metrics", {"step": 1}]',
+        '["artifact", {"path": "/etc/passwd"}]',
+        '["artifact", {"path": "summary.json", "folder": "../elsewhere"}]',
+        '["tags", {"mlflow.runName": "defaced"}]',
+        '["tags", {"seed": "0", "dmil.folder": "/elsewhere"}]',
+    ],
+)
 def test_a_damaged_record_is_named_by_file_and_line(tmp_path: Path, line: str, complaint):
     Identity.found_or_made(tmp_path, "an experiment")
     (tmp_path / "tracking.jsonl").write_text(f'["tags", {{}}]\n{line}\n["tags", {{}}]\n')
