@@ -19,7 +19,7 @@ from services.cli.progress import Clock, console
 from services.demonstrations.store import DATA, open_store
 from services.distributed.ray_runner import RunnerKind, open_runner
 from services.evaluation.summary import summarise
-from services.experiments.champions import ALIAS, open_contest
+from services.experiments.champions import ALIAS, open_promotion
 from services.experiments.experiment import Experiment
 from services.reporting.end_of_run import show, write_report
 from services.storage.checkpoints import Checkpoint, Checkpoints
@@ -62,21 +62,21 @@ def run(arguments: Sequence[str]) -> None:
     experiment = Experiment(config, store := open_store())
     announce(evaluation=(given.output, "--output FOLDER"), demonstrations=(store.root, f"{DATA}=FOLDER"))
     given.output.mkdir(parents=True, exist_ok=True)
-    contest = open_contest(checkpoint, experiment, given.output / ALIAS) if given.promote else None
+    promotion = open_promotion(checkpoint, experiment, given.output / ALIAS) if given.promote else None
     clock = Clock()
     with open_runner(given.runner, experiment.suite, given.workers) as runner:
         clock.lap("start")
         data = experiment.collect(runner)
         clock.lap("collect")
         evaluation = experiment.evaluate(runner, data, checkpoint, given.output, given.tasks)
-        if contest is not None:
-            contest.evaluate_rival(runner, data)
+        if promotion is not None:
+            promotion.evaluate_champion(runner, data)
         clock.lap("evaluate")
     summary = summarise(evaluation, seconds=clock.seconds, folder=given.output)
     write_report(summary, given.output)
     show(summary)
-    if contest is not None:
-        for line in contest.settle(evaluation, given.output):
+    if promotion is not None:
+        for line in promotion.decide(evaluation, given.output):
             console.print(line, markup=False, soft_wrap=True)
 
 

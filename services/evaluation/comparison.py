@@ -24,7 +24,7 @@ from dmil_core.seeding import named_rng
 from dmil_core.statistics import interquartile_mean, mean_score, stratified_bootstrap, success_rate
 from services.evaluation.paper_results import Published
 from services.evaluation.results import EpisodeResult, EvaluationFolder, Metric
-from services.evaluation.summary import sub_skill_use
+from services.evaluation.summary import sub_skill_shares
 from services.suites.base import Split
 from services.tracking.history import read_metrics
 
@@ -33,8 +33,8 @@ DIGITS: Mapping[Metric, int] = {"success_rate": 3, "score": 2}
 """That a mean is shown to."""
 
 
-class Place(NamedTuple):
-    """What one cell is of."""
+class CellKey(NamedTuple):
+    """What tells a cell from the others."""
 
     row: str
     suite: str
@@ -42,8 +42,8 @@ class Place(NamedTuple):
     shots: int
 
 
-class Tried(NamedTuple):
-    """What one seed was tried on at a place, and what came of it."""
+class SeedOutcomes(NamedTuple):
+    """The episodes of one seed in a cell, and their outcomes."""
 
     protocol: str
     tasks: tuple[str, ...]
@@ -54,12 +54,12 @@ class Tried(NamedTuple):
     """The success or the score of each."""
 
 
-Outcomes = Mapping[int, Tried]
+Outcomes = Mapping[int, SeedOutcomes]
 """Of each seed."""
 
 
 @dataclass(frozen=True)
-class Contender(EvaluationFolder):
+class SeedEvaluation(EvaluationFolder):
     """One seed of a row on a suite: a configuration that was trained, and an evaluation of it."""
 
     row: str
@@ -148,83 +148,82 @@ class Comparison:
     """What the table has in its rows; suites are then those of one benchmark."""
     baseline: str | None
     """The row that the others are compared with, if any is."""
-    contenders: Sequence[Contender]
-    published: Mapping[Place, Published]
+    evaluations: Sequence[SeedEvaluation]
+    published: Mapping[CellKey, Published]
     """The paper's figures."""
 
     @cached_property
-    def places(self) -> list[Place]:
-        """All, also those that nothing is known of."""
-        return [Place(*of) for of in itertools.product(self.rows, self.suites, self.splits, self.shots)]
+    def keys(self) -> list[CellKey]:
+        """Those of all cells, also of cells without episodes."""
+        return [CellKey(*of) for of in itertools.product(self.rows, self.suites, self.splits, self.shots)]
 
     @cached_property
-    def outcomes(self) -> dict[Place, Outcomes]:
+    def outcomes(self) -> dict[CellKey, Outcomes]:
         """The outcome of each episode.
 
         Raises:
             UserError: if a row has not as many episodes of each task and seed.
         """
-        found: dict[Place, dict[int, Tried]] = defaultdict(dict)
-        for contender in self.contenders:
+        outcomes: dict[CellKey, dict[int, SeedOutcomes]] = defaultdict(dict)
+        for evaluation in self.evaluations:
             groups: dict[tuple[Split, int], list[EpisodeResult]] = defaultdict(list)
-            for episode in contender.episodes:
+            for episode in evaluation.episodes:
                 groups[episode.split, episode.shots].append(episode)
             for (split, shots), group in groups.items():
-                seeds = found[Place(contender.row, contender.suite, split, shots)]
-                seeds[contender.seed] = own = _tried(group, self.metric, contender)
-                if len({tried.outcomes.shape for tried in seeds.values()}) > 1:
-                    raise _other_episodes(contender, own.outcomes.shape)
-        return dict(found)
+                seeds = outcomes[CellKey(evaluation.row, evaluation.suite, split, shots)]
+                seeds[evaluation.seed] = outcome = _seed_outcomes(group, self.metric, evaluation)
+                if len({of_seed.outcomes.shape for of_seed in seeds.values()}) > 1:
+                    raise _other_episodes(evaluation, outcome.outcomes.shape)
+        return dict(outcomes)
 
     @cached_property
     def cells(self) -> list[Cell]:
-        """A mean for each place that something is known of."""
-        return [self._cell(place) for place in self.places if place in self.outcomes]
+        """The mean of each cell that has episodes."""
+        return [self._cell(key) for key in self.keys if key in self.outcomes]
 
-    def _cell(self, place: Place) -> Cell:
-        own = [found for found in self.contenders if (found.row, found.suite) == (place.row, place.suite)]
-        adaptations = [row for found in own for row in found.adaptations if row.shots == place.shots]
-        use = sub_skill_use(adaptations).get(place.split)
-        steps = sum(found.environment_steps for found in own)
+    def _cell(self, key: CellKey) -> Cell:
+        evaluations = [of for of in self.evaluations if (of.row, of.suite) == (key.row, key.suite)]
+        adaptations = [row for of in evaluations for row in of.adaptations if row.shots == key.shots]
+        use = sub_skill_shares(adaptations).get(key.split)
+        steps = sum(of.environment_steps for of in evaluations)
         in_use = use and use.in_use_per_task
-        return cell(place, self.outcomes[place], in_use, self.published.get(place), self.metric, steps)
+        return cell(key, self.outcomes[key], in_use, self.published.get(key), self.metric, steps)
 
     @cached_property
     def pairs(self) -> list[Difference | Unpaired]:
         """Each row against the baseline, wherever there are both."""
         return [
-            difference(place, self.baseline, self.outcomes[place], self.outcomes[place._replace(row=self.baseline)])
-            for place in self.places
+            difference(key, self.baseline, self.outcomes[key], self.outcomes[key._replace(row=self.baseline)])
+            for key in self.keys
             if self.baseline is not None
-            and place.row != self.baseline
-            and {place, place._replace(row=self.baseline)} <= self.outcomes.keys()
+            and key.row != self.baseline
+            and {key, key._replace(row=self.baseline)} <= self.outcomes.keys()
         ]
 
 
-def _tried(rows: Sequence[EpisodeResult], metric: Metric, contender: Contender) -> Tried:
+def _seed_outcomes(rows: Sequence[EpisodeResult], metric: Metric, evaluation: SeedEvaluation) -> SeedOutcomes:
     by_task: dict[str, list[EpisodeResult]] = defaultdict(list)
     for row in sorted(rows, key=lambda row: (row.task, row.episode)):
         by_task[row.task].append(row)
-    counts = tuple(len(own) for own in by_task.values())
+    counts = tuple(len(of_task) for of_task in by_task.values())
     if len(set(counts)) > 1:
-        raise _other_episodes(contender, counts)
-    values = [
-        [float(row.success if metric == "success_rate" else row.score) for row in own] for own in by_task.values()
-    ]
-    episodes = tuple(tuple((row.episode, row.seed, row.goal) for row in own) for own in by_task.values())
-    return Tried(rows[0].protocol, tuple(by_task), episodes, np.array(values))
+        raise _other_episodes(evaluation, counts)
+    tasks = by_task.values()
+    values = [[float(row.success if metric == "success_rate" else row.score) for row in task] for task in tasks]
+    episodes = tuple(tuple((row.episode, row.seed, row.goal) for row in task) for task in tasks)
+    return SeedOutcomes(rows[0].protocol, tuple(by_task), episodes, np.array(values))
 
 
-def _other_episodes(contender: Contender, got: tuple[int, ...]) -> UserError:
+def _other_episodes(evaluation: SeedEvaluation, got: tuple[int, ...]) -> UserError:
     return UserError(
-        f"{contender.folder}: got rows of {contender.row} with not as many episodes of each task and seed: "
-        f"{', '.join(map(str, got))}; remove the folder, in a sweep also trials/{contender.name}/result.json, and "
+        f"{evaluation.folder}: got rows of {evaluation.row} with not as many episodes of each task and seed: "
+        f"{', '.join(map(str, got))}; remove the folder, in a sweep also trials/{evaluation.name}/result.json, and "
         "evaluate again"
     )
 
 
 def cell(
-    place: Place,
+    key: CellKey,
     outcomes: Outcomes,
     in_use: float | None,
     paper: Published | None,
@@ -235,18 +234,18 @@ def cell(
     seeds = sorted(outcomes)
     values = np.stack([outcomes[seed].outcomes for seed in seeds])
     if len(seeds) > 1:
-        found = stratified_bootstrap(values, named_rng(0, "table", *map(str, place)))
+        estimate = stratified_bootstrap(values, named_rng(0, "table", *map(str, key)))
         kind = "bootstrap over seeds and episodes"
     elif metric == "success_rate":
-        found, kind = success_rate((values > 0).ravel().tolist()), "Wilson"
+        estimate, kind = success_rate((values > 0).ravel().tolist()), "Wilson"
     else:
-        found, kind = mean_score(values.ravel().tolist()), "Student"
-    mean, low, high = found.mean, *((None, None) if np.isnan(found.low) else (found.low, found.high))
+        estimate, kind = mean_score(values.ravel().tolist()), "Student"
+    mean, low, high = estimate.mean, *((None, None) if np.isnan(estimate.low) else (estimate.low, estimate.high))
     outside = None
     if paper is not None and low is not None and high is not None:
         outside = not low <= paper.value <= high and abs(mean - paper.value) > (paper.spread or 0.0)
     return Cell(
-        **place._asdict(),
+        **key._asdict(),
         seeds=seeds,
         tasks=values.shape[1],
         episodes=values.size,
@@ -263,25 +262,23 @@ def cell(
     )
 
 
-def difference(place: Place, baseline: str, outcomes: Outcomes, others: Outcomes) -> Difference | Unpaired:
+def difference(key: CellKey, baseline: str, outcomes: Outcomes, others: Outcomes) -> Difference | Unpaired:
     """Return how one row differs from another on the seeds and episodes that both have, or why nobody can tell."""
     seeds = sorted(outcomes.keys() & others.keys())
-    pair = {**place._asdict(), "baseline": baseline}
+    pair = {**key._asdict(), "baseline": baseline}
     if not seeds:
-        own, other = (" ".join(map(str, sorted(found))) for found in (outcomes, others))
-        return Unpaired(**pair, why=f"they have no seed in common: {own} against {other}")
+        left, right = (" ".join(map(str, sorted(of))) for of in (outcomes, others))
+        return Unpaired(**pair, why=f"they have no seed in common: {left} against {right}")
     for seed in seeds:
         if why := _what_differs(outcomes[seed], others[seed]):
             return Unpaired(**pair, why=why)
     values = np.stack([outcomes[seed].outcomes - others[seed].outcomes for seed in seeds])
-    found = stratified_bootstrap(values, named_rng(0, "difference", *map(str, place)))
-    differs: Answer = "yes, higher" if found.low > 0 else "yes, lower" if found.high < 0 else "not decided"
-    return Difference(
-        **pair, seeds=seeds, pairs=values.size, mean=found.mean, low=found.low, high=found.high, differs=differs
-    )
+    mean, low, high, *_ = stratified_bootstrap(values, named_rng(0, "difference", *map(str, key)))
+    differs: Answer = "yes, higher" if low > 0 else "yes, lower" if high < 0 else "not decided"
+    return Difference(**pair, seeds=seeds, pairs=values.size, mean=mean, low=low, high=high, differs=differs)
 
 
-def _what_differs(one: Tried, other: Tried) -> str | None:
+def _what_differs(one: SeedOutcomes, other: SeedOutcomes) -> str | None:
     """Return in words what keeps the episodes of one seed from being the same ones."""
     if one.protocol != other.protocol:
         return f"their protocols differ: {one.protocol}, against {other.protocol}"

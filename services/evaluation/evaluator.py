@@ -18,7 +18,7 @@ from services.distributed.metrics import EPISODES, SUCCESS_RATE, SUCCESSES, Mete
 from services.distributed.runner import Runner, Simulation
 from services.distributed.work_items import AdaptationItem, AdaptationRollouts
 from services.evaluation.results import AdaptationResult, EpisodeResult, ImitationResult, write_rows
-from services.evaluation.summary import Evaluation, cells, rates, sub_skill_use
+from services.evaluation.summary import Evaluation, rates, sub_skill_shares, summary_rows
 from services.rollouts.adaptations import Adaptation, AdaptationOutcome, ImitationErrors, plan_adaptations
 from services.storage.checkpoints import Checkpoint, Checkpoints, iteration_of
 from services.storage.provenance import library_versions
@@ -222,8 +222,8 @@ class Evaluations:
             tallies.add(adaptation, outcome)
         tallies.finish()
         self.latest = {"success": list(tallies), "after": iteration}
-        found = cells(evaluation.episodes, evaluation.best_score, self._evaluator.config.method)
-        self._tracker.metrics(iteration, rates(found, sub_skill_use(evaluation.adaptations)))
+        found = summary_rows(evaluation.episodes, evaluation.best_score, self._evaluator.config.method)
+        self._tracker.metrics(iteration, rates(found, sub_skill_shares(evaluation.adaptations)))
         success_rates = "; ".join(f"{cell.split} {cell.shots}-shot {cell.success_rate:.3f}" for cell in found)
         logger.info(f"success rates after {iteration} iterations: {success_rates}")
 

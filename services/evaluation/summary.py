@@ -56,7 +56,7 @@ class Score(BaseModel):
     per_task: dict[str, float]
 
 
-class Cell(BaseModel):
+class SummaryRow(BaseModel):
     """The success rate of one split and size of support set."""
 
     suite: str
@@ -73,7 +73,7 @@ class Cell(BaseModel):
     """The paper's success rate for DMIL, or its score where there are scores."""
 
 
-class SubSkillUse(BaseModel):
+class SubSkillShares(BaseModel):
     """How the adapted policies of one split use their sub-skills on held-out demonstrations."""
 
     share: list[float]
@@ -92,9 +92,9 @@ class Summary(BaseModel):
     method: str
     environment_steps: int
     """Steps that an online method took in the environments of meta-training tasks."""
-    rows: list[Cell]
+    rows: list[SummaryRow]
     seconds: dict[str, float]
-    sub_skills: dict[Split, SubSkillUse]
+    sub_skills: dict[Split, SubSkillShares]
     protocol: str
     seed: int
     checkpoint: str
@@ -112,7 +112,7 @@ class Summary(BaseModel):
         return any(len(use.share) > 1 and max(use.share) > COLLAPSED for use in self.sub_skills.values())
 
 
-def cells(episodes: Sequence[EpisodeResult], best_score: int, method: MethodConfig) -> list[Cell]:
+def summary_rows(episodes: Sequence[EpisodeResult], best_score: int, method: MethodConfig) -> list[SummaryRow]:
     """Return one cell for each split and size of support set, with Wilson intervals.
 
     Where the score of an episode in which all is done is more than 1, scores are given too.
@@ -125,7 +125,7 @@ def cells(episodes: Sequence[EpisodeResult], best_score: int, method: MethodConf
         tasks = dict.fromkeys(row.task for row in rows)
         per_task = {task: float(np.mean([row.success for row in rows if row.task == task])) for task in tasks}
         found.append(
-            Cell(
+            SummaryRow(
                 suite=suite,
                 split=split,
                 shots=shots,
@@ -156,16 +156,16 @@ def _score(rows: Sequence[EpisodeResult], best: int) -> Score:
     )
 
 
-def sub_skill_use(adaptations: Sequence[AdaptationResult]) -> dict[Split, SubSkillUse]:
+def sub_skill_shares(adaptations: Sequence[AdaptationResult]) -> dict[Split, SubSkillShares]:
     """Return the use of sub-skills in each split, where there are several."""
-    use: dict[Split, SubSkillUse] = {}
+    use: dict[Split, SubSkillShares] = {}
     for split in ("meta-training", "meta-testing"):
         rows = [row for row in adaptations if row.split == split and row.steps]
         if not rows or len(rows[0].sub_skill_steps) == 1:
             continue
         steps = np.array([row.sub_skill_steps for row in rows])
         share = steps.sum(0) / steps.sum()
-        use[split] = SubSkillUse(
+        use[split] = SubSkillShares(
             share=share.tolist(),
             entropy=share_entropy(share),
             in_use_per_task=float((steps / steps.sum(1, keepdims=True) > 0.1).sum(1).mean()),
@@ -174,7 +174,7 @@ def sub_skill_use(adaptations: Sequence[AdaptationResult]) -> dict[Split, SubSki
     return use
 
 
-def rates(rows: Sequence[Cell], use: Mapping[Split, SubSkillUse]) -> dict[str, float]:
+def rates(rows: Sequence[SummaryRow], use: Mapping[Split, SubSkillShares]) -> dict[str, float]:
     """Return the metrics of an evaluation by the names they are tracked under: of each task, and in all."""
     found: dict[str, float] = {}
     for cell in rows:
@@ -199,9 +199,9 @@ def summarise(
     return Summary(
         method=config.method.name,
         environment_steps=evaluation.checkpoint.manifest.environment_steps,
-        rows=cells(evaluation.episodes, evaluation.best_score, config.method),
+        rows=summary_rows(evaluation.episodes, evaluation.best_score, config.method),
         seconds=seconds,
-        sub_skills=sub_skill_use(evaluation.adaptations),
+        sub_skills=sub_skill_shares(evaluation.adaptations),
         protocol=evaluation.protocol,
         seed=config.seed,
         checkpoint=str(evaluation.checkpoint.path),
@@ -254,7 +254,7 @@ def headline(summary: Summary) -> list[list[str]]:
     return [[fields[index] for index in kept] for fields in (columns, *rows)]
 
 
-def _fields(cell: Cell) -> list[str]:
+def _fields(cell: SummaryRow) -> list[str]:
     successes = f"{round(cell.success_rate * cell.episodes)}/{cell.episodes}"
     fields = [cell.suite, cell.split, str(cell.shots), successes, f"{cell.success_rate:.3f}"]
     fields.append(interval_text(cell.low, cell.high, 3))
@@ -266,7 +266,7 @@ def _fields(cell: Cell) -> list[str]:
     return [*fields, "" if cell.paper is None else cell.paper.text(3 if score is None else 2)]
 
 
-def _of_task(cell: Cell, task: str) -> str:
+def _of_task(cell: SummaryRow, task: str) -> str:
     score = "" if cell.score is None else f", score {cell.score.per_task[task]:.2f}"
     return f"{cell.per_task[task]:.2f}{score}"
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from dmil_core.errors import RunError, UserError
 from services.demonstrations.store import TaskDemonstrations
 from services.distributed.runner import Runner
-from services.evaluation.comparison import Comparison, Contender, Difference, Unpaired
+from services.evaluation.comparison import Comparison, Difference, SeedEvaluation, Unpaired
 from services.evaluation.summary import Evaluation
 from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoint
@@ -46,7 +46,7 @@ def _asking(uri: str) -> Iterator[None]:
         ) from None  # its text may hold secrets
 
 
-def open_contest(checkpoint: Checkpoint, experiment: Experiment, folder: Path) -> "Contest":
+def open_promotion(checkpoint: Checkpoint, experiment: Experiment, folder: Path) -> "Promotion":
     """Find the model of a checkpoint, and the champion that it is to be compared with in `folder`.
 
     Raises:
@@ -61,15 +61,15 @@ def open_contest(checkpoint: Checkpoint, experiment: Experiment, folder: Path) -
         has_one = bool(found) and ALIAS in found[0].aliases
         champion = client.get_model_version_by_alias(name, ALIAS) if has_one else None
         if champion is None or champion.source == _address(challenger.model_id):
-            return Contest(client, uri, experiment, challenger, champion, None, folder)
-        rival = Checkpoint(_downloaded(client, champion, uri, folder / "model"))
-    theirs = open_suite(rival.manifest.config.suite).protocol
+            return Promotion(client, uri, experiment, challenger, champion, None, folder)
+        champion_checkpoint = Checkpoint(_downloaded(client, champion, uri, folder / "model"))
+    theirs = open_suite(champion_checkpoint.manifest.config.suite).protocol
     if theirs != experiment.suite.protocol:
         raise UserError(
             f"--promote: got the protocol {experiment.suite.protocol!r}; wanted that of {name}'s champion, {theirs!r}; "
             f"take the alias {ALIAS} from it in MLflow, and the next model has it"
         )
-    return Contest(client, uri, experiment, challenger, champion, rival, folder)
+    return Promotion(client, uri, experiment, challenger, champion, champion_checkpoint, folder)
 
 
 def _model_of(client: "MlflowClient", checkpoint: Checkpoint) -> "LoggedModel":
@@ -109,7 +109,7 @@ def _downloaded(client: "MlflowClient", version: "ModelVersion", uri: str, folde
 
 
 @dataclass(frozen=True)
-class Contest:
+class Promotion:
     """A model, and the one that it would take the alias from."""
 
     client: "MlflowClient"
@@ -117,15 +117,15 @@ class Contest:
     experiment: Experiment
     challenger: "LoggedModel"
     champion: "ModelVersion | None"
-    rival: Checkpoint | None
+    champion_checkpoint: Checkpoint | None
     """The champion's, if there is a champion and it is another model."""
     folder: Path
 
-    def evaluate_rival(self, runner: Runner, data: Mapping[str, TaskDemonstrations]) -> None:
+    def evaluate_champion(self, runner: Runner, data: Mapping[str, TaskDemonstrations]) -> None:
         """Evaluate the champion, if it is another model, in the challenger's episodes."""
-        if self.rival is None:
+        if self.champion_checkpoint is None:
             return
-        ours, theirs = self.experiment.config, self.rival.manifest.config
+        ours, theirs = self.experiment.config, self.champion_checkpoint.manifest.config
         own = {name: getattr(theirs.evaluation, name) for name in ("fine_tuning_steps", "learning_rate")}
         config = theirs.model_copy(
             update={
@@ -135,9 +135,9 @@ class Contest:
                 "evaluation": ours.evaluation.model_copy(update=own),
             }
         )
-        Experiment(config, self.experiment.store).evaluate(runner, data, self.rival, self.folder)
+        Experiment(config, self.experiment.store).evaluate(runner, data, self.champion_checkpoint, self.folder)
 
-    def settle(self, evaluation: Evaluation, folder: Path) -> list[str]:
+    def decide(self, evaluation: Evaluation, folder: Path) -> list[str]:
         """Register the challenger, move the alias if it is due, and return in words what was decided and why.
 
         Raises:
@@ -149,7 +149,7 @@ class Contest:
             if champion is None:
                 self.client.set_registered_model_alias(name, ALIAS, version)
                 return [f"{name}: version {version} is the first {ALIAS}"]
-            if self.rival is None:
+            if self.champion_checkpoint is None:
                 return [f"{name}: version {version} is the {ALIAS} already"]
             pairs = self._pairs(evaluation, folder, version)
             lines = [_describe(pair) for pair in pairs]
@@ -172,11 +172,11 @@ class Contest:
     def _pairs(self, evaluation: Evaluation, folder: Path, version: str) -> Sequence[Difference | Unpaired]:
         """Return how the challenger differs from the champion in meta-testing tasks, by the size of support sets."""
         assert self.champion is not None
-        assert self.rival is not None
+        assert self.champion_checkpoint is not None
         config, name = self.experiment.config, self.experiment.suite.name
         ours, theirs = f"version {version}", f"version {self.champion.version}"
-        contenders = [
-            Contender(
+        evaluations = [
+            SeedEvaluation(
                 folder=rows,
                 row=row,
                 suite=name,
@@ -188,7 +188,7 @@ class Contest:
             )
             for row, checkpoint, rows in (
                 (ours, evaluation.checkpoint, folder),
-                (theirs, self.rival, self.folder),
+                (theirs, self.champion_checkpoint, self.folder),
             )
         ]
         return Comparison(
@@ -199,7 +199,7 @@ class Contest:
             metric="score" if evaluation.best_score > 1 else "success_rate",
             by="variants",
             baseline=theirs,
-            contenders=contenders,
+            evaluations=evaluations,
             published={},
         ).pairs
 

@@ -28,8 +28,8 @@ from services.reporting.drawing import (
     panels,
     scale_by_logarithms,
 )
-from services.reporting.lineup import MOST_TASKS, policy_after
 from services.reporting.page import DataTable, Part, Prose, Section
+from services.reporting.run_group import MOST_TASKS, policy_after
 from services.storage.files import read_file, write_file
 
 FOLDER, PLAN, IMITATION = "adaptation", "plan.json", "imitation.jsonl"

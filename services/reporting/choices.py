@@ -11,7 +11,7 @@ from dmil_core.methods.base import Policy
 from dmil_core.seeding import named_seed
 from dmil_core.settings import sub_skills_of
 from services.experiments.finished_run import FinishedRun
-from services.reporting.lineup import Lineup, has_sub_skills, policies
+from services.reporting.run_group import RunGroup, has_sub_skills, policies
 from services.rollouts.episodes import rollout
 from services.suites.base import Environment, build_env
 
@@ -108,7 +108,7 @@ class Choices(NamedTuple):
         return usage([timeline.sub_skills for timeline in self.timelines[on]], self.sub_skills)
 
 
-def choices_on(lineup: Lineup, task: str, shots: int, rollouts: int) -> list[Choices]:
+def choices_on(group: RunGroup, task: str, shots: int, rollouts: int) -> list[Choices]:
     """Return what each run that has sub-skills chooses on a task, before and after adaptation.
 
     Its rollouts are those of the run's own evaluation with the same support set.
@@ -116,13 +116,13 @@ def choices_on(lineup: Lineup, task: str, shots: int, rollouts: int) -> list[Cho
     Raises:
         UserError: if no demonstration is left to look at.
     """
-    support, others = lineup.shots(task, shots)
-    suite, found = lineup.experiment.suite, []
+    support, others = group.shots(task, shots)
+    suite, found = group.experiment.suite, []
     with ExitStack() as open_envs:
         envs = [build_env(suite, task) for _ in range(rollouts)]
         for env in envs:
             open_envs.callback(env.close)
-        for label, run in lineup.runs.items():
+        for label, run in group.runs.items():
             if not has_sub_skills(run):
                 continue
             for adaptation, policy in policies(run, support).items():

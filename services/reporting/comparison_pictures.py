@@ -27,13 +27,13 @@ Runs = Mapping[str, Float[np.ndarray, "seeds tasks"]]
 def means(comparison: Comparison) -> Picture:
     """Draw the means of every row, a panel for each suite and split."""
     metric, digits = comparison.metric.replace("_", " "), DIGITS[comparison.metric]
-    by_place: dict[str, list[str]] = defaultdict(list)
-    for of in comparison.cells:
-        by_place[f"{_where(of)}, {of.shots}-shot"].append(f"{of.row} {of.mean:.{digits}f}")
-    told = "; ".join(f"{place}: {', '.join(rows)}" for place, rows in by_place.items())
-    hollow = "Hollow marks are the paper's figures. " if any(of.paper for of in comparison.cells) else ""
+    by_condition: dict[str, list[str]] = defaultdict(list)
+    for cell in comparison.cells:
+        by_condition[f"{_where(cell)}, {cell.shots}-shot"].append(f"{cell.row} {cell.mean:.{digits}f}")
+    text = "; ".join(f"{condition}: {', '.join(rows)}" for condition, rows in by_condition.items())
+    hollow = "Hollow marks are the paper's figures. " if any(cell.paper for cell in comparison.cells) else ""
     with _means_figure(comparison) as figure:
-        return drawn(figure, f"Mean {metric} of each row; bars are 95% intervals", f"{hollow}{told}.")
+        return drawn(figure, f"Mean {metric} of each row; bars are 95% intervals", f"{hollow}{text}.")
 
 
 def draw_means(comparison: Comparison, path: Path, title: str) -> None:
@@ -43,8 +43,8 @@ def draw_means(comparison: Comparison, path: Path, title: str) -> None:
         figure.savefig(path, dpi=110, facecolor="white")
 
 
-def _where(of: Cell) -> str:
-    return f"{of.suite}, {of.split}"
+def _where(cell: Cell) -> str:
+    return f"{cell.suite}, {cell.split}"
 
 
 @contextmanager
@@ -52,11 +52,11 @@ def _means_figure(comparison: Comparison) -> Iterator[Figure]:
     titles = list(dict.fromkeys(map(_where, comparison.cells)))
     columns = min(len(titles), 2)
     lines = -(-len(titles) // columns)
-    rows = [row for row in comparison.rows if any(of.row == row for of in comparison.cells)]
+    rows = [row for row in comparison.rows if any(cell.row == row for cell in comparison.cells)]
     height = 1.2 + 0.13 * max(4, len(rows) * (len(comparison.shots) + 1))
     with panels(lines, columns, width=5.3 * columns, height=height * lines) as (figure, axes):
         for axis, title in zip(axes, titles, strict=False):
-            _draw_means(axis, rows, [of for of in comparison.cells if _where(of) == title])
+            _draw_means(axis, rows, [cell for cell in comparison.cells if _where(cell) == title])
             axis.set(title=title, xlabel=f"mean {comparison.metric.replace('_', ' ')}")
             axis.set_xlim(-0.02, 1.02 if comparison.metric == "success_rate" else None)
         for axis in axes[len(titles) :]:
@@ -71,20 +71,20 @@ def _means_figure(comparison: Comparison) -> Iterator[Figure]:
 
 
 def _draw_means(axis: Axes, rows: Sequence[str], cells: Sequence[Cell]) -> None:
-    shots = sorted({of.shots for of in cells})
+    shots = sorted({cell.shots for cell in cells})
     for index, count in enumerate(shots):
-        own = [of for of in cells if of.shots == count]
-        look = {"color": colour_of(index), "fmt": marker_of(index), "markersize": 5, "capsize": 3}
-        y = [rows.index(of.row) + APART * (index - (len(shots) - 1) / 2) for of in own]
-        below = [of.mean - (of.mean if of.low is None else of.low) for of in own]
-        above = [(of.mean if of.high is None else of.high) - of.mean for of in own]
-        axis.errorbar([of.mean for of in own], y, xerr=[below, above], label=f"{count}-shot", **look)
-        papers = [(place + APART / 3, of.paper) for place, of in zip(y, own, strict=True) if of.paper]
+        of_shots = [cell for cell in cells if cell.shots == count]
+        style = {"color": colour_of(index), "fmt": marker_of(index), "markersize": 5, "capsize": 3}
+        y = [rows.index(cell.row) + APART * (index - (len(shots) - 1) / 2) for cell in of_shots]
+        below = [cell.mean - (cell.mean if cell.low is None else cell.low) for cell in of_shots]
+        above = [(cell.mean if cell.high is None else cell.high) - cell.mean for cell in of_shots]
+        axis.errorbar([cell.mean for cell in of_shots], y, xerr=[below, above], label=f"{count}-shot", **style)
+        papers = [(height + APART / 3, cell.paper) for height, cell in zip(y, of_shots, strict=True) if cell.paper]
         if papers:
             axis.errorbar(
-                [paper.value for _, paper in papers], [place for place, _ in papers],
+                [paper.value for _, paper in papers], [height for height, _ in papers],
                 xerr=[paper.spread or 0.0 for _, paper in papers], mfc="none", elinewidth=0.8,
-                label=f"{count}-shot, paper", **look,
+                label=f"{count}-shot, paper", **style,
             )  # fmt: skip
     axis.set_yticks(range(len(rows)), rows)
     axis.set_ylim(len(rows) - 0.5, -0.5)
@@ -126,13 +126,13 @@ def heat_map(
 
 
 def _described(rows: Sequence[str], tasks: Sequence[str], values: Float[np.ndarray, "tasks rows"], digits: int) -> str:
-    told = []
-    for row, own in zip(rows, values.T, strict=True):
-        known = [(value, task) for value, task in zip(own, tasks, strict=True) if not np.isnan(value)]
+    texts = []
+    for row, of_row in zip(rows, values.T, strict=True):
+        known = [(value, task) for value, task in zip(of_row, tasks, strict=True) if not np.isnan(value)]
         if known:
             (least, worst), (most, best) = min(known), max(known)
-            told.append(f"{row} from {least:.{digits}f} ({worst}) to {most:.{digits}f} ({best})")
-    return f"Tasks downwards, from those solved most. {'; '.join(told)}."
+            texts.append(f"{row} from {least:.{digits}f} ({worst}) to {most:.{digits}f} ({best})")
+    return f"Tasks downwards, from those solved most. {'; '.join(texts)}."
 
 
 def profiles(where: str, rows: Sequence[str], by_shots: Mapping[int, Runs], metric: str, digits: int) -> Picture:
@@ -140,19 +140,19 @@ def profiles(where: str, rows: Sequence[str], by_shots: Mapping[int, Runs], metr
 
     All `rows` keep their colours, whether or not `by_shots` has them.
     """
-    told = []
-    top = max(1.0, *(float(runs.max()) for own in by_shots.values() for runs in own.values()))
+    texts = []
+    top = max(1.0, *(float(runs.max()) for by_row in by_shots.values() for runs in by_row.values()))
     with panels(1, len(by_shots), width=5.3 * len(by_shots), height=3.6) as (figure, axes):
-        for axis, (shots, own) in zip(axes, by_shots.items(), strict=True):
-            for row, runs in own.items():
+        for axis, (shots, by_row) in zip(axes, by_shots.items(), strict=True):
+            for row, runs in by_row.items():
                 middle = f"{row}: {interquartile_mean(runs.ravel().tolist()):.{digits}f}"
                 _draw_profile(axis, rows.index(row), runs, top, middle, named_rng(0, "profile", where, str(shots), row))
-                told.append(f"{shots}-shot {middle} over {runs.size} runs")
+                texts.append(f"{shots}-shot {middle} over {runs.size} runs")
             axis.set(title=f"{where}, {shots}-shot", xlabel=f"{metric} τ", ylabel="fraction of runs above τ")
             axis.set(xlim=(-0.01 * top, 1.02 * top), ylim=(-0.02, 1.02))
             axis.legend(fontsize="small", title="interquartile mean", title_fontsize="small")
         title = f"Performance profile, {where}"
-        return drawn(figure, title, f"Higher is better. Interquartile means: {'; '.join(told)}.")
+        return drawn(figure, title, f"Higher is better. Interquartile means: {'; '.join(texts)}.")
 
 
 def _draw_profile(

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from dmil_core.settings import MethodConfig
 from services.evaluation.results import EpisodeResult
-from services.evaluation.summary import cells
+from services.evaluation.summary import summary_rows
 from services.experiments.finished_run import FinishedRun
 from services.reporting.bands import Curve, chunks_of, draw_curve
 from services.reporting.drawing import Picture, colour_of, drawn, marker_of, panels, style_of
@@ -199,7 +199,7 @@ def draw_success(
     evaluations: Mapping[int, Sequence[EpisodeResult]], method: MethodConfig, best_score: int
 ) -> list[Picture]:
     """Return how success, and the score where there is one, went over the iterations."""
-    found = {iteration: cells(evaluations[iteration], best_score, method) for iteration in sorted(evaluations)}
+    found = {iteration: summary_rows(evaluations[iteration], best_score, method) for iteration in sorted(evaluations)}
     rates: Lines = defaultdict(list)
     scores: Lines = defaultdict(list)
     for iteration, of_iteration in found.items():

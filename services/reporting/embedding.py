@@ -11,8 +11,8 @@ from dmil_core.settings import sub_skills_of
 from services.cli.progress import Bar
 from services.reporting.choices import shares_in_words, usage
 from services.reporting.drawing import Picture, colour_of, drawn, legend_of_markers, marker_of, panels
-from services.reporting.lineup import Lineup, has_sub_skills, policies
 from services.reporting.page import Part, Prose, Section
+from services.reporting.run_group import RunGroup, has_sub_skills, policies
 
 SHOTS, OTHERS = 3, 16
 """Demonstrations that the paper adapts to, and those whose states it draws."""
@@ -64,7 +64,7 @@ def embed(states: Float[np.ndarray, "states obs_dim"], perplexity: float, seed: 
     return tsne.fit_transform(states).astype(np.float32)
 
 
-def embedding_section(lineup: Lineup, shots: int = SHOTS, perplexity: float = PERPLEXITY, seed: int = SEED) -> Section:
+def embedding_section(group: RunGroup, shots: int = SHOTS, perplexity: float = PERPLEXITY, seed: int = SEED) -> Section:
     """Return a section with a picture for each task, of all runs whose methods have sub-skills.
 
     The perplexity of t-SNE is a third of the states where there are few.
@@ -73,7 +73,7 @@ def embedding_section(lineup: Lineup, shots: int = SHOTS, perplexity: float = PE
         UserError: if no demonstration is left to look at.
     """
     title = "t-SNE of states by sub-skill"
-    if not any(map(has_sub_skills, lineup.runs.values())):
+    if not any(map(has_sub_skills, group.runs.values())):
         return Section(title, [])
     parts: list[Part] = [
         Prose(
@@ -83,16 +83,16 @@ def embedding_section(lineup: Lineup, shots: int = SHOTS, perplexity: float = PE
             "and their sizes mean nothing. The paper reads fewer, connected regions as more meaningful sub-skills."
         )
     ]
-    with Bar("embedding states", len(lineup.held_out)) as bar:
-        for task in lineup.held_out:
-            parts.append(_draw(lineup, task, shots, perplexity, seed))
+    with Bar("embedding states", len(group.held_out)) as bar:
+        for task in group.held_out:
+            parts.append(_draw(group, task, shots, perplexity, seed))
             bar.advance(1, task)
     return Section(title, parts)
 
 
-def _draw(lineup: Lineup, task: str, shots: int, perplexity: float, seed: int) -> Picture:
-    support, others = lineup.shots(task, shots, OTHERS)
-    runs = {label: run for label, run in lineup.runs.items() if has_sub_skills(run)}
+def _draw(group: RunGroup, task: str, shots: int, perplexity: float, seed: int) -> Picture:
+    support, others = group.shots(task, shots, OTHERS)
+    runs = {label: run for label, run in group.runs.items() if has_sub_skills(run)}
     kept = thin_out(others, min(MOST_STATES, MOST_POINTS // (2 * len(runs))))
     perplexity = min(perplexity, max(1.0, (len(kept.states) - 1) / 3))
     places = embed(Normalisation.of(others)(kept.states), perplexity, seed)

@@ -19,10 +19,10 @@ from services.reporting.curves import training_curves
 from services.reporting.embedding import embedding_section
 from services.reporting.end_of_run import PAGE
 from services.reporting.failures import failures_of_run
-from services.reporting.lineup import has_sub_skills, line_up
 from services.reporting.page import Section, write_page
 from services.reporting.provenance import episodes_of_run, origin_of_run
 from services.reporting.rates import rates_of_tasks, table_of_all
+from services.reporting.run_group import group_runs, has_sub_skills
 from services.reporting.settings import settings_of_run
 from services.reporting.sub_skills import sub_skill_sections
 
@@ -37,8 +37,8 @@ def _sub_skills(finished: FinishedRun) -> list[Section]:
     """Return what the high level chooses in tasks of meta-testing, and where, if there is a choice."""
     if not has_sub_skills(finished):
         return []
-    lineup = line_up({finished.name: finished})
-    return [*sub_skill_sections(lineup), embedding_section(lineup)]
+    group = group_runs({finished.name: finished})
+    return [*sub_skill_sections(group), embedding_section(group)]
 
 
 def _curves(finished: FinishedRun) -> list[Section]:

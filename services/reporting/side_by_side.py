@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dmil_core.statistics import interval_text
-from services.evaluation.comparison import DIGITS, Cell, Comparison, Contender, Difference, Place, Unpaired
+from services.evaluation.comparison import DIGITS, Cell, CellKey, Comparison, Difference, SeedEvaluation, Unpaired
 from services.reporting.bands import curves
 from services.reporting.comparison_pictures import Runs, heat_map, means, profiles
 from services.reporting.drawing import Picture
@@ -43,20 +43,18 @@ def _metric(comparison: Comparison) -> str:
 
 
 def _warnings(comparison: Comparison) -> Iterator[str]:
-    """Say what keeps rows from being a contest."""
+    """Say what keeps rows from being compared fairly."""
     for suite in comparison.suites:
-        tried = {
-            place: next(iter(seeds.values())) for place, seeds in comparison.outcomes.items() if place.suite == suite
-        }
-        protocols = _rows_by({place.row: own.protocol for place, own in tried.items()})
+        outcomes = {key: next(iter(seeds.values())) for key, seeds in comparison.outcomes.items() if key.suite == suite}
+        protocols = _rows_by({key.row: first.protocol for key, first in outcomes.items()})
         if len(protocols) > 1:
-            told = "; ".join(f"{', '.join(rows)}: {protocol}" for protocol, rows in protocols.items())
-            yield f"The protocols of {suite} differ, so the figures are of different things: {told}."
+            text = "; ".join(f"{', '.join(rows)}: {protocol}" for protocol, rows in protocols.items())
+            yield f"The protocols of {suite} differ, so the figures are of different things: {text}."
         for split in comparison.splits:
-            tasks = _rows_by({place.row: own.tasks for place, own in tried.items() if place.split == split})
+            tasks = _rows_by({key.row: first.tasks for key, first in outcomes.items() if key.split == split})
             if len(tasks) > 1:
-                told = "; ".join(f"{', '.join(rows)}: {', '.join(names)}" for names, rows in tasks.items())
-                yield f"The {split} tasks of {suite} differ, so the means are over different tasks: {told}."
+                text = "; ".join(f"{', '.join(rows)}: {', '.join(names)}" for names, rows in tasks.items())
+                yield f"The {split} tasks of {suite} differ, so the means are over different tasks: {text}."
 
 
 def _rows_by(values: Mapping[str, Any]) -> dict[Any, list[str]]:
@@ -71,24 +69,24 @@ def _overview(comparison: Comparison) -> list[Part]:
         return [Prose("Nothing is finished yet.")]
     digits = DIGITS[comparison.metric]
     rows = []
-    for of in comparison.cells:
-        interval = _together(interval_text(of.low, of.high, digits))
-        paper = "" if of.paper is None else _together(of.paper.text(digits))
-        apart = "" if of.difference is None else f"{of.difference:+.{digits}f}{', outside' if of.outside else ''}"
-        in_use = "" if of.sub_skills_in_use is None else f"{of.sub_skills_in_use:.1f}"
-        counts = [f"{len(of.seeds)}", f"{of.tasks}", f"{of.episodes}"]
-        figures = [f"{of.mean:.{digits}f}", interval, f"{of.interquartile_mean:.{digits}f}"]
-        rows.append([*_place(comparison, of), *figures, *counts, paper, apart, in_use])
+    for cell in comparison.cells:
+        interval = _together(interval_text(cell.low, cell.high, digits))
+        paper = "" if cell.paper is None else _together(cell.paper.text(digits))
+        apart = "" if cell.difference is None else f"{cell.difference:+.{digits}f}{', outside' if cell.outside else ''}"
+        in_use = "" if cell.sub_skills_in_use is None else f"{cell.sub_skills_in_use:.1f}"
+        counts = [f"{len(cell.seeds)}", f"{cell.tasks}", f"{cell.episodes}"]
+        figures = [f"{cell.mean:.{digits}f}", interval, f"{cell.interquartile_mean:.{digits}f}"]
+        rows.append([*_place(comparison, cell), *figures, *counts, paper, apart, in_use])
     head = ["row", "suite", "split", "shots", f"mean {_metric(comparison)}", "95% interval", "interquartile mean"]
     head += ["seeds", "tasks", "episodes", "paper", "from the paper", "sub-skills in use"]
-    told = (
+    text = (
         "Over several seeds the interval is a stratified bootstrap's: seeds are drawn with replacement, then the "
         "episodes of each task; over one seed it is Wilson's, or Student's for scores, and says nothing of what "
         "another seed would do. The interquartile mean is over tasks and seeds. Outside: the paper's figure lies "
         "outside our interval, and our mean outside its spread. In use is a sub-skill with over a tenth of a task's "
         "states after adaptation."
     )
-    return [means(comparison), _filled(f"{_metric(comparison).capitalize()}s", head, rows), Prose(told)]
+    return [means(comparison), _filled(f"{_metric(comparison).capitalize()}s", head, rows), Prose(text)]
 
 
 def _together(figures: str) -> str:
@@ -96,8 +94,8 @@ def _together(figures: str) -> str:
     return figures.replace(" ", "\u00a0")
 
 
-def _place(comparison: Comparison, of: Cell | Difference) -> list[str]:
-    return [of.row, of.suite if len(comparison.suites) > 1 else "", of.split, f"{of.shots}"]
+def _place(comparison: Comparison, cell: Cell | Difference) -> list[str]:
+    return [cell.row, cell.suite if len(comparison.suites) > 1 else "", cell.split, f"{cell.shots}"]
 
 
 def _filled(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> DataTable:
@@ -111,29 +109,29 @@ def _differences(comparison: Comparison) -> list[Part]:
         return []
     digits = DIGITS[comparison.metric]
     rows = []
-    for of in comparison.pairs:
-        if isinstance(of, Difference):
-            interval = interval_text(of.low, of.high, digits, "+")
-            counts = f"{of.pairs}", f"{len(of.seeds)}"
-            rows.append([*_place(comparison, of), f"{of.mean:+.{digits}f}", interval, of.differs, *counts])
-    told = (
+    for pair in comparison.pairs:
+        if isinstance(pair, Difference):
+            interval = interval_text(pair.low, pair.high, digits, "+")
+            counts = f"{pair.pairs}", f"{len(pair.seeds)}"
+            rows.append([*_place(comparison, pair), f"{pair.mean:+.{digits}f}", interval, pair.differs, *counts])
+    text = (
         f"Each row less {comparison.baseline}, on the same seeds and the same episodes, so that what both share falls "
         "out. The interval is a stratified bootstrap's over seeds and episodes, over one seed of its episodes. "
         "Where it holds zero, nothing is decided, which is not to say that there is no difference."
     )
     head = ["row", "suite", "split", "shots", "difference", "95% interval", "differs?", "pairs", "seeds"]
-    parts = [Prose(told), _filled(f"Differences from {comparison.baseline}", head, rows)] if rows else []
+    parts = [Prose(text), _filled(f"Differences from {comparison.baseline}", head, rows)] if rows else []
     return [*parts, *map(Prose, _unpaired(comparison))]
 
 
 def _unpaired(comparison: Comparison) -> Iterator[str]:
     by_reason: dict[tuple[str, str], list[Unpaired]] = defaultdict(list)
-    for of in comparison.pairs:
-        if isinstance(of, Unpaired):
-            by_reason[of.row, of.why].append(of)
-    for (row, why), found in by_reason.items():
-        everywhere = len(found) == sum(of.row == row for of in comparison.pairs)
-        places = "; ".join(f"{of.suite}, {of.split}, {of.shots}-shot" for of in found)
+    for pair in comparison.pairs:
+        if isinstance(pair, Unpaired):
+            by_reason[pair.row, pair.why].append(pair)
+    for (row, why), pairs in by_reason.items():
+        everywhere = len(pairs) == sum(pair.row == row for pair in comparison.pairs)
+        places = "; ".join(f"{pair.suite}, {pair.split}, {pair.shots}-shot" for pair in pairs)
         where = "" if everywhere else f" on {places}"
         yield f"{row} is not paired with {comparison.baseline}{where}: {why}."
 
@@ -149,48 +147,48 @@ def _profiles(comparison: Comparison) -> list[Part]:
     pictures: list[Part] = []
     for called, suites in _benchmarks(comparison).items():
         for split in comparison.splits:
-            found = {shots: _runs_of(comparison, suites, split, shots) for shots in comparison.shots}
-            by_shots = {shots: own for shots, own in found.items() if any(runs.size > 1 for runs in own.values())}
+            by_shots = {shots: _runs_of(comparison, suites, split, shots) for shots in comparison.shots}
+            by_shots = {shots: runs for shots, runs in by_shots.items() if any(of.size > 1 for of in runs.values())}
             if by_shots:
                 metric, digits = _metric(comparison), DIGITS[comparison.metric]
                 pictures.append(profiles(f"{called}, {split}", comparison.rows, by_shots, metric, digits))
-    several = any(len(of.seeds) > 1 for of in comparison.cells)
+    several = any(len(cell.seeds) > 1 for cell in comparison.cells)
     band = (
         "The band is a stratified bootstrap's, 95%, threshold by threshold: seeds are drawn with replacement, all runs "
         "of a seed together, for one training serves all tasks."
         if several
         else "There is one seed of each row, which says nothing of another: so there are no bands."
     )
-    told = (
+    text = (
         f"A run is one seed on one task. The curve is the fraction of runs whose {_metric(comparison)} is above τ: the "
         f"higher the better, and a row whose curve is nowhere below another's is better throughout. {band} (Agarwal et "
         "al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS 2021.)"
     )
-    return [Prose(told), *pictures] if pictures else []
+    return [Prose(text), *pictures] if pictures else []
 
 
 def _runs_of(comparison: Comparison, suites: Sequence[str], split: Split, shots: int) -> Runs:
     """Return what each row came to that was run on all of some suites: of each seed on each task."""
-    found = {}
+    runs = {}
     for row in comparison.rows:
-        own = [comparison.outcomes.get(Place(row, suite, split, shots), {}) for suite in suites]
-        if seeds := sorted(set.intersection(*map(set, own))):
-            rates = [np.concatenate([seen[seed].outcomes.mean(1) for seen in own]) for seed in seeds]
-            found[row] = np.stack(rates)
-    return found
+        by_suite = [comparison.outcomes.get(CellKey(row, suite, split, shots), {}) for suite in suites]
+        if seeds := sorted(set.intersection(*map(set, by_suite))):
+            rates = [np.concatenate([outcomes[seed].outcomes.mean(1) for outcomes in by_suite]) for seed in seeds]
+            runs[row] = np.stack(rates)
+    return runs
 
 
 def _heat_maps(comparison: Comparison) -> list[Part]:
     pictures: list[Part] = []
-    outcomes = [tried.outcomes for seeds in comparison.outcomes.values() for tried in seeds.values()]
+    outcomes = [seed.outcomes for seeds in comparison.outcomes.values() for seed in seeds.values()]
     top = max(1.0, *(float(values.max()) for values in outcomes)) if outcomes else 1.0
     for called, suites in _benchmarks(comparison).items():
         for split in comparison.splits:
             by_shots = {shots: _by_task(comparison, suites, split, shots) for shots in comparison.shots}
-            order = _from_the_easiest([own for by_row in by_shots.values() for own in by_row.values()])
+            order = _from_the_easiest([by_task for by_row in by_shots.values() for by_task in by_row.values()])
             for shots, by_row in by_shots.items():
                 if by_row:
-                    values = [[own.get(task, np.nan) for own in by_row.values()] for task in order]
+                    values = [[by_task.get(task, np.nan) for by_task in by_row.values()] for task in order]
                     title = f"{_metric(comparison).capitalize()} on each task: {called}, {split}, {shots}-shot"
                     names = [task if len(suites) == 1 else f"{suite}: {task}" for suite, task in order]
                     pictures.append(
@@ -198,8 +196,8 @@ def _heat_maps(comparison: Comparison) -> list[Part]:
                             title, list(by_row), names, np.array(values), top=top, metric=f"mean {_metric(comparison)}"
                         )
                     )
-    told = "The mean over seeds and episodes. Tasks stand in one order for all shots, from that which most rows solve."
-    return [Prose(told), *pictures] if pictures else []
+    text = "The mean over seeds and episodes. Tasks stand in one order for all shots, from that which most rows solve."
+    return [Prose(text), *pictures] if pictures else []
 
 
 Task = tuple[str, str]
@@ -208,89 +206,91 @@ Task = tuple[str, str]
 
 def _by_task(comparison: Comparison, suites: Sequence[str], split: Split, shots: int) -> dict[str, dict[Task, float]]:
     """Return the mean of each row on each task, of the rows that have any."""
-    found: dict[str, dict[Task, float]] = {}
+    by_row: dict[str, dict[Task, float]] = {}
     for row in comparison.rows:
         for suite in suites:
-            if seeds := comparison.outcomes.get(Place(row, suite, split, shots)):
-                own = np.mean([tried.outcomes.mean(1) for tried in seeds.values()], 0)
+            if seeds := comparison.outcomes.get(CellKey(row, suite, split, shots)):
+                means = np.mean([seed.outcomes.mean(1) for seed in seeds.values()], 0)
                 tasks = next(iter(seeds.values())).tasks
-                found.setdefault(row, {}).update(zip([(suite, task) for task in tasks], own.tolist(), strict=True))
-    return found
+                by_row.setdefault(row, {}).update(zip([(suite, task) for task in tasks], means.tolist(), strict=True))
+    return by_row
 
 
 def _from_the_easiest(means: Sequence[Mapping[Task, float]]) -> list[Task]:
-    tasks = sorted({task for own in means for task in own})
-    return sorted(tasks, key=lambda task: -float(np.mean([own[task] for own in means if task in own])))
+    tasks = sorted({task for by_task in means for task in by_task})
+    return sorted(tasks, key=lambda task: -float(np.mean([by_task[task] for by_task in means if task in by_task])))
 
 
 def _curves(comparison: Comparison) -> list[Part]:
     pictures: list[Picture | None] = []
     for suite in comparison.suites:
         rows = _trained(comparison, suite)
-        metrics = {", ".join(names): [of.metrics for of in own] for names, own in rows.items()}
+        metrics = {", ".join(names): [seed.metrics for seed in seeds] for names, seeds in rows.items()}
         places = [(split, shots) for split in comparison.splits for shots in comparison.shots]
         rates = {f"{split}, {shots}-shot": f"{comparison.metric}/{split}/{shots}-shot" for split, shots in places}
         title = f"{_metric(comparison).capitalize()} over training, {suite}"
         pictures.append(curves(title, metrics, rates, rate=comparison.metric == "success_rate"))
-        names = dict.fromkeys(name for own in metrics.values() for rows_ in own for row in rows_ for name in row)
+        names = dict.fromkeys(name for seeds in metrics.values() for seed in seeds for row in seed for name in row)
         losses = {name.replace("_", " "): name for name in names if "loss" in name}
         pictures.append(curves(f"Losses over training, {suite}", metrics, losses))
-    told = (
+    text = (
         "The line is the mean over a row's seeds, in means of neighbouring iterations, and the band reaches from the "
         "lowest seed to the highest. Over one seed a success rate's band is its 95% interval over episodes, and a loss "
         "has none. Losses of different methods are different things: compare their course, not their height."
     )
     drawn = [picture for picture in pictures if picture is not None]
-    return [Prose(told), *drawn] if drawn else []
+    return [Prose(text), *drawn] if drawn else []
 
 
-def _trained(comparison: Comparison, suite: str) -> dict[tuple[str, ...], list[Contender]]:
-    """Return the contenders on a suite by their rows; rows that differ only in how they are evaluated are one here."""
-    homes: dict[str, dict[Path, Contender]] = {}
-    for of in comparison.contenders:
-        if of.suite == suite:
-            homes.setdefault(of.row, {})[of.home] = of
-    rows = _rows_by({row: tuple(own) for row, own in homes.items()})
+def _trained(comparison: Comparison, suite: str) -> dict[tuple[str, ...], list[SeedEvaluation]]:
+    """Return the evaluations on a suite by their rows; rows that differ only in how they are evaluated are one here."""
+    homes: dict[str, dict[Path, SeedEvaluation]] = {}
+    for evaluation in comparison.evaluations:
+        if evaluation.suite == suite:
+            homes.setdefault(evaluation.row, {})[evaluation.home] = evaluation
+    rows = _rows_by({row: tuple(evaluations) for row, evaluations in homes.items()})
     return {tuple(names): list(homes[names[0]].values()) for names in rows.values()}
 
 
 def _settings(comparison: Comparison) -> list[Part]:
-    found: dict[str, dict[str, list[str]]] = {}
-    for of in comparison.contenders:
-        for setting, value in _flat(of).items():
-            values = found.setdefault(setting, {}).setdefault(of.row, [])
+    by_setting: dict[str, dict[str, list[str]]] = {}
+    for evaluation in comparison.evaluations:
+        for setting, value in _flat(evaluation).items():
+            values = by_setting.setdefault(setting, {}).setdefault(evaluation.row, [])
             if value not in values:
                 values.append(value)
-    rows = list(dict.fromkeys(of.row for of in comparison.contenders))
-    table = [[setting, *("; ".join(own.get(row, [])) for row in rows)] for setting, own in found.items()]
+    rows = list(dict.fromkeys(evaluation.row for evaluation in comparison.evaluations))
+    table = [[setting, *("; ".join(by_row.get(row, [])) for row in rows)] for setting, by_row in by_setting.items()]
     # A method's own settings stand together, wherever the first row that has them came.
-    sections = list(dict.fromkeys(setting.partition(".")[0] for setting in found))
+    sections = list(dict.fromkeys(setting.partition(".")[0] for setting in by_setting))
     differing = [line for line in table if len(set(line[1:])) > 1]
     differing.sort(key=lambda line: sections.index(line[0].partition(".")[0]))
-    told = "All else is the same, but for the seed. An empty field is a setting that the method does not have."
+    text = "All else is the same, but for the seed. An empty field is a setting that the method does not have."
     if not differing:
-        return [Prose("None but the seed.")] if found else []
-    return [DataTable("Settings that differ", ["setting", *rows], differing), Prose(told)]
+        return [Prose("None but the seed.")] if by_setting else []
+    return [DataTable("Settings that differ", ["setting", *rows], differing), Prose(text)]
 
 
-def _flat(of: Contender) -> dict[str, str]:
-    """Return all settings of a contender but the seed, with what else decides its figures."""
-    found: dict[str, str] = {}
-    for section, settings in of.config.model_dump(mode="json", exclude={"seed"}).items():
+def _flat(evaluation: SeedEvaluation) -> dict[str, str]:
+    """Return all settings of an evaluation but the seed, with what else decides its figures."""
+    settings_by_name: dict[str, str] = {}
+    for section, settings in evaluation.config.model_dump(mode="json", exclude={"seed"}).items():
         for name, value in settings.items():
-            found[f"{section}.{name}"] = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-    data = {f"{row.task} {row.data}" for row in of.episodes}
-    versions = of.episodes[0].versions if of.episodes else {}
-    found["data sets' SHA-256"] = sha256("\n".join(sorted(data)).encode())[:12]
-    return found | {f"version of {name}": version for name, version in versions.items()}
+            settings_by_name[f"{section}.{name}"] = (
+                ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+            )
+    data = {f"{row.task} {row.data}" for row in evaluation.episodes}
+    versions = evaluation.episodes[0].versions if evaluation.episodes else {}
+    settings_by_name["data sets' SHA-256"] = sha256("\n".join(sorted(data)).encode())[:12]
+    return settings_by_name | {f"version of {name}": version for name, version in versions.items()}
 
 
 def _runs(comparison: Comparison) -> list[Part]:
     rows = []
-    for of in comparison.contenders:
-        steps_taken = f"{of.environment_steps:,}" if of.environment_steps else ""
-        checkpoint = of.episodes[0].checkpoint[:12] if of.episodes else ""
-        which = [of.name, of.row, of.suite, f"{of.seed}", of.config.method.name]
-        rows.append([*which, f"{of.config.training.iterations}", steps_taken, checkpoint])
+    for evaluation in comparison.evaluations:
+        steps_taken = f"{evaluation.environment_steps:,}" if evaluation.environment_steps else ""
+        checkpoint = evaluation.episodes[0].checkpoint[:12] if evaluation.episodes else ""
+        which = [evaluation.name, evaluation.row, evaluation.suite, f"{evaluation.seed}", evaluation.config.method.name]
+        rows.append([*which, f"{evaluation.config.training.iterations}", steps_taken, checkpoint])
     head = ["run", "row", "suite", "seed", "method", "iterations", "environment steps", "checkpoint"]
     return [_filled("Runs", head, rows)] if rows else []

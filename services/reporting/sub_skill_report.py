@@ -18,8 +18,8 @@ from services.cli.progress import console
 from services.experiments.finished_run import FinishedRun
 from services.reporting.embedding import PERPLEXITY, SEED, embedding_section
 from services.reporting.embedding import SHOTS as EMBEDDING_SHOTS
-from services.reporting.lineup import Lineup, has_sub_skills, line_up
 from services.reporting.page import DataTable, Prose, write_page
+from services.reporting.run_group import RunGroup, group_runs, has_sub_skills
 from services.reporting.sub_skills import sub_skill_sections
 from services.storage.run_folders import find_folder
 
@@ -57,14 +57,14 @@ def run(arguments: Sequence[str]) -> None:
     given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
     _check(given)
     torch.set_num_threads(1)
-    lineup = line_up(_found(given.which, given.runs), given.tasks)
-    sections = sub_skill_sections(lineup, given.shots, given.rollouts)
-    sections.append(embedding_section(lineup, given.embedding_shots, given.perplexity, given.seed))
+    group = group_runs(_found(given.which, given.runs), given.tasks)
+    sections = sub_skill_sections(group, given.shots, given.rollouts)
+    sections.append(embedding_section(group, given.embedding_shots, given.perplexity, given.seed))
     lead = [
         Prose("Which sub-skill the high level takes, and where, before adaptation to a task and after it."),
-        _runs_table(lineup),
+        _runs_table(group),
     ]
-    write_page(given.output, f"Sub-skills on {', '.join(lineup.held_out)}", lead, sections)
+    write_page(given.output, f"Sub-skills on {', '.join(group.held_out)}", lead, sections)
     console.print(str(given.output), markup=False)
 
 
@@ -99,9 +99,9 @@ def _found(which: Sequence[str], runs: Path) -> dict[str, FinishedRun]:
     return found
 
 
-def _runs_table(lineup: Lineup) -> DataTable:
+def _runs_table(group: RunGroup) -> DataTable:
     rows = []
-    for label, own in lineup.runs.items():
+    for label, own in group.runs.items():
         evaluation, checkpoint = own.config.evaluation, own.checkpoint
         rows.append(
             [

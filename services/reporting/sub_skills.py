@@ -5,26 +5,26 @@ from collections.abc import Sequence
 
 from services.cli.progress import Bar
 from services.reporting.choices import DEMONSTRATIONS, ROLLOUTS, Choices, choices_on
-from services.reporting.lineup import Lineup, has_sub_skills
 from services.reporting.page import DataTable, Part, Prose, Section
+from services.reporting.run_group import RunGroup, has_sub_skills
 from services.reporting.sub_skill_pictures import draw_timelines, draw_transitions, draw_usage
 
 DRAWN = 3
 """So many demonstrations are drawn; the statistics are of all."""
 
 
-def sub_skill_sections(lineup: Lineup, shots: int = 1, rollouts: int = 3) -> list[Section]:
+def sub_skill_sections(group: RunGroup, shots: int = 1, rollouts: int = 3) -> list[Section]:
     """Return a section for each task, with all runs whose methods have sub-skills; none if there is no such run.
 
     Raises:
         UserError: if no demonstration is left to look at.
     """
-    if not any(map(has_sub_skills, lineup.runs.values())):
+    if not any(map(has_sub_skills, group.runs.values())):
         return []
     found = []
-    with Bar("looking at sub-skills", len(lineup.held_out)) as bar:
-        for task in lineup.held_out:
-            shown = choices_on(lineup, task, shots, rollouts)
+    with Bar("looking at sub-skills", len(group.held_out)) as bar:
+        for task in group.held_out:
+            shown = choices_on(group, task, shots, rollouts)
             found.append(Section(f"Sub-skills on {task}", _parts(task, shots, shown)))
             bar.advance(1, task)
     return found

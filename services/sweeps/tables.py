@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import BaseModel
 
 from services.cli.composition import with_evaluation
-from services.evaluation.comparison import Cell, Comparison, Contender, Difference, Place, Unpaired
+from services.evaluation.comparison import Cell, CellKey, Comparison, Difference, SeedEvaluation, Unpaired
 from services.evaluation.paper_results import figure
 from services.evaluation.results import Metric
 from services.sweeps.folders import SweepFolder
@@ -65,22 +65,24 @@ def comparison_of(sweep: SweepFolder, baseline: str | None = None) -> Comparison
         metric=settings.metric,
         by=settings.rows,
         baseline=None if settings.search else named,
-        contenders=list(_contenders(sweep)),
+        evaluations=list(_evaluations(sweep)),
         published={},
     )
     if settings.paper is None:
         return comparison
-    figures = {place: figure(settings.paper, *place) for place in comparison.places}
-    return replace(comparison, published={place: found for place, found in figures.items() if found is not None})
+    paper_figures = {key: figure(settings.paper, *key) for key in comparison.keys}
+    return replace(
+        comparison, published={key: published for key, published in paper_figures.items() if published is not None}
+    )
 
 
-def _contenders(sweep: SweepFolder) -> Iterator[Contender]:
+def _evaluations(sweep: SweepFolder) -> Iterator[SeedEvaluation]:
     for name, trial in sweep.trials.items():
         result = sweep.result(name)
         if result is None:
             continue
         for row, folder in result.evaluated.items():
-            yield Contender(
+            yield SeedEvaluation(
                 row=row,
                 suite=trial.suite,
                 seed=trial.seed,
@@ -109,7 +111,7 @@ def tables_of(sweep: SweepFolder, comparison: Comparison | None = None) -> Table
         command=record.command,
         by=settings.rows,
         rows=list(settings.suites if settings.rows == "suites" else settings.row_names),
-        columns=list(dict.fromkeys(column_of(place, settings.rows) for place in comparison.places)),
+        columns=list(dict.fromkeys(column_of(key, settings.rows) for key in comparison.keys)),
         cells=comparison.cells,
         differences=[pair for pair in comparison.pairs if isinstance(pair, Difference)],
         unpaired=[pair for pair in comparison.pairs if isinstance(pair, Unpaired)],
@@ -120,10 +122,10 @@ def tables_of(sweep: SweepFolder, comparison: Comparison | None = None) -> Table
     )
 
 
-def column_of(place: Place | Cell, by: str) -> str:
+def column_of(key: CellKey | Cell, by: str) -> str:
     """Return the column of the table that a cell stands in."""
-    first = place.row if by == "suites" else place.suite
-    return f"{first}, {place.split}, {place.shots}-shot"
+    first = key.row if by == "suites" else key.suite
+    return f"{first}, {key.split}, {key.shots}-shot"
 
 
 def _samples(sweep: SweepFolder) -> list[Sample]:

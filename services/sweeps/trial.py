@@ -18,7 +18,7 @@ from services.cli.progress import Clock, console_logging
 from services.demonstrations.store import DemoStore
 from services.distributed.ray_runner import RayRunner
 from services.evaluation.results import EpisodeResult, read_rows
-from services.evaluation.summary import cells, rates
+from services.evaluation.summary import rates, summary_rows
 from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoint, Checkpoints
 from services.storage.files import read_file, write_file
@@ -173,7 +173,7 @@ def _record(
 ) -> float:
     """Record the rates of an evaluation, and return what a search would go by."""
     rows = read_rows(folder / "episodes.jsonl", EpisodeResult)
-    found = rates(cells(rows, experiment.suite.best_score, experiment.config.method), {})
+    metrics = rates(summary_rows(rows, experiment.suite.best_score, experiment.config.method), {})
     iteration = checkpoint.manifest.iteration
-    tracker.metrics(iteration, {f"{prefix}/{name}" if prefix else name: value for name, value in found.items()})
-    return float(np.mean([value for name, value in found.items() if name.startswith(f"{metric}/meta-testing/")]))
+    tracker.metrics(iteration, {f"{prefix}/{name}" if prefix else name: value for name, value in metrics.items()})
+    return float(np.mean([value for name, value in metrics.items() if name.startswith(f"{metric}/meta-testing/")]))

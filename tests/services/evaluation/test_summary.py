@@ -6,7 +6,7 @@ from scipy.stats import norm, t
 from dmil_core.methods.dmil.config import DmilConfig
 from services.evaluation.paper_results import Published
 from services.evaluation.results import AdaptationResult, EpisodeResult
-from services.evaluation.summary import cells, sub_skill_use
+from services.evaluation.summary import sub_skill_shares, summary_rows
 
 ROW = {
     "suite": "ml10",
@@ -42,7 +42,7 @@ def test_a_cell_counts_its_own_episodes_and_has_wilsons_interval() -> None:
     rows = [episode("meta-training", "reach", 1, n, n < 3) for n in range(4)]
     rows += [episode("meta-training", "push", 1, n, n < 1) for n in range(4)]
     rows += [episode("meta-testing", "lever-pull", 3, n, False) for n in range(2)]
-    train, test = cells(rows, 1, DmilConfig())
+    train, test = summary_rows(rows, 1, DmilConfig())
     assert (train.split, train.shots, train.episodes, train.success_rate) == ("meta-training", 1, 8, 0.5)
     assert train.per_task == {"reach": 0.75, "push": 0.25}
     assert train.paper is not None
@@ -55,11 +55,13 @@ def test_a_cell_counts_its_own_episodes_and_has_wilsons_interval() -> None:
 
 def test_a_part_of_a_suite_has_no_figure_of_the_papers_beside_it() -> None:
     rows = [episode("meta-training", "reach", 1, 0, True).model_copy(update={"suite": "ml10-part"})]
-    assert cells(rows, 1, DmilConfig())[0].paper is None
+    assert summary_rows(rows, 1, DmilConfig())[0].paper is None
 
 
 def test_sub_skill_use_is_weighted_by_states_and_counts_those_in_use() -> None:
-    use = sub_skill_use([adaptation("meta-training", (90, 10, 0), 100), adaptation("meta-training", (50, 0, 50), 50)])
+    use = sub_skill_shares(
+        [adaptation("meta-training", (90, 10, 0), 100), adaptation("meta-training", (50, 0, 50), 50)]
+    )
     assert set(use) == {"meta-training"}
     assert use["meta-training"].share == pytest.approx([0.7, 0.05, 0.25])
     assert use["meta-training"].agreement == pytest.approx(0.75)
@@ -67,13 +69,13 @@ def test_sub_skill_use_is_weighted_by_states_and_counts_those_in_use() -> None:
 
 
 def test_collapse_is_entropy_zero() -> None:
-    assert sub_skill_use([adaptation("meta-testing", (0, 7, 0), 7)])["meta-testing"].entropy == 0
+    assert sub_skill_shares([adaptation("meta-testing", (0, 7, 0), 7)])["meta-testing"].entropy == 0
 
 
 def test_the_papers_figures_are_those_it_prints() -> None:
     printed = "DMIL 0.775±0.010 0.949±0.009 0.396±0.016 0.710±0.021"
     rows = [episode(split, "reach", shots, 0, True) for split in ("meta-training", "meta-testing") for shots in (1, 3)]
-    papers = [cell.paper for cell in cells(rows, 1, DmilConfig())]
+    papers = [cell.paper for cell in summary_rows(rows, 1, DmilConfig())]
     assert [f"{paper.value:.3f}±{paper.spread:.3f}" for paper in papers if paper] == printed.split()[1:]
 
 
@@ -83,7 +85,7 @@ def test_a_suite_of_sub_tasks_has_scores():
         for task, scores in (("a", (0, 1, 2, 3, 4, 4, 2)), ("b", (1, 1, 1, 1, 1, 1, 0)))
         for n, score in enumerate(scores)
     ]
-    (cell,) = cells(rows, 4, DmilConfig(sub_skills=2))
+    (cell,) = summary_rows(rows, 4, DmilConfig(sub_skills=2))
     assert cell.success_rate == 2 / 14
     score = cell.score
     assert score is not None
@@ -94,7 +96,7 @@ def test_a_suite_of_sub_tasks_has_scores():
     half = t.ppf(0.975, 13) * stdev(values) / 14**0.5
     assert (score.low, score.high) == pytest.approx((22 / 14 - half, 22 / 14 + half))
     assert cell.paper == Published(value=2.45, spread=0.25, table="Table 5")
-    assert cells(rows, 4, DmilConfig())[0].paper is None
-    (alone,) = cells(rows[:1], 4, DmilConfig(sub_skills=2))
+    assert summary_rows(rows, 4, DmilConfig())[0].paper is None
+    (alone,) = summary_rows(rows[:1], 4, DmilConfig(sub_skills=2))
     assert alone.score is not None
     assert (alone.score.mean, alone.score.deviation, alone.score.low) == (0, None, None)

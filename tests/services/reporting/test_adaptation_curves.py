@@ -13,8 +13,8 @@ from services.distributed.runner import LocalRunner
 from services.evaluation.results import EpisodeResult, ImitationResult, read_rows
 from services.experiments.finished_run import FinishedRun
 from services.reporting.adaptation_curves import adaptation_section, measure, points
-from services.reporting.lineup import policy_after
 from services.reporting.page import DataTable, Prose, write_page
+from services.reporting.run_group import policy_after
 from services.rollouts.adaptations import imitation_error
 
 TASK = "blue-green-red"

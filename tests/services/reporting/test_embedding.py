@@ -14,7 +14,7 @@ from dmil_core.errors import UserError
 from services.experiments.finished_run import FinishedRun
 from services.reporting.drawing import Picture, colour_of
 from services.reporting.embedding import embed, embedding_section, thin_out
-from services.reporting.lineup import line_up, policies
+from services.reporting.run_group import group_runs, policies
 
 TASK = "blue-green-red"
 Trained = Callable[..., FinishedRun]
@@ -78,9 +78,9 @@ def test_near_states_lie_near_each_other_and_a_seed_names_it_all():
 
 def test_points_are_as_many_as_the_choices_of_each_sub_skill(trained: Trained):
     run = trained("run")
-    lineup = line_up({"run": run})
-    picture = picture_of(embedding_section(lineup, perplexity=20, seed=7))
-    support, others = lineup.shots(TASK, 3)
+    group = group_runs({"run": run})
+    picture = picture_of(embedding_section(group, perplexity=20, seed=7))
+    support, others = group.shots(TASK, 3)
     chosen = [policy.sub_skill_use(other).chosen for policy in policies(run, support).values() for other in others]
     wanted = Counter(colour_of(k) for steps in chosen for k in steps.tolist())
     wanted.update(colour_of(k) for k in range(3))  # in the legend
@@ -96,8 +96,8 @@ def test_points_are_as_many_as_the_choices_of_each_sub_skill(trained: Trained):
 
 
 def test_all_panels_show_the_same_places(trained: Trained):
-    lineup = line_up({"A": trained("run"), "B": trained("other", "option-gail-offline")})
-    picture = picture_of(embedding_section(lineup, perplexity=5))
+    group = group_runs({"A": trained("run"), "B": trained("other", "option-gail-offline")})
+    picture = picture_of(embedding_section(group, perplexity=5))
     panels = re.split(r'<g id="[^"]*(?:axes_|legend_)\d', picture.svg)[1:5]
     heights = [
         sorted(float(y) for y in re.findall(r'<use [^>]*y="([\d.]+)" style="fill: #', panel)) for panel in panels
@@ -111,15 +111,15 @@ def test_all_panels_show_the_same_places(trained: Trained):
 
 def test_a_picture_of_many_states_stays_small(trained: Trained):
     longer = {"demonstrations": {"per_task": 26, "held_out": 20, "noise": 0.5}}
-    lineup = line_up({name: trained(name, **longer) for name in "ABCD"})
-    picture = picture_of(embedding_section(lineup))
+    group = group_runs({name: trained(name, **longer) for name in "ABCD"})
+    picture = picture_of(embedding_section(group))
     assert len(picture.svg) < 300_000
     assert "of those in 16 held-out demonstrations; adapted to 3 others" in picture.description
 
 
 def test_few_states_get_a_perplexity_that_they_allow(trained: Trained):
-    lineup = line_up({"run": trained("run", demonstrations={"per_task": 8, "held_out": 3})})
-    picture = picture_of(embedding_section(lineup, shots=2, perplexity=1000))
+    group = group_runs({"run": trained("run", demonstrations={"per_task": 8, "held_out": 3})})
+    picture = picture_of(embedding_section(group, shots=2, perplexity=1000))
     states = int(picture.description.split()[0])
     told = re.search(r"perplexity ([\d.]+)", picture.description)
     assert told is not None
@@ -127,6 +127,6 @@ def test_few_states_get_a_perplexity_that_they_allow(trained: Trained):
 
 
 def test_without_sub_skills_or_demonstrations_there_is_nothing_to_draw(trained: Trained):
-    assert embedding_section(line_up({"flat": trained("flat", "behaviour-cloning")})).parts == []
+    assert embedding_section(group_runs({"flat": trained("flat", "behaviour-cloning")})).parts == []
     with pytest.raises(UserError, match="got 8; wanted fewer than the 8"):
-        embedding_section(line_up({"run": trained("run")}), shots=8)
+        embedding_section(group_runs({"run": trained("run")}), shots=8)

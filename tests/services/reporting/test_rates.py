@@ -6,7 +6,7 @@ import pytest
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.statistics import mean_score, success_rate
 from services.evaluation.results import EpisodeResult, write_rows
-from services.evaluation.summary import Summary, cells, write_summary
+from services.evaluation.summary import Summary, summary_rows, write_summary
 from services.experiments.finished_run import FinishedRun
 from services.reporting.drawing import Picture
 from services.reporting.page import DataTable, Prose
@@ -31,7 +31,7 @@ def written(folder: Path, episodes: list[EpisodeResult], best: int = 1) -> Finis
     summary = Summary(
         method="dmil",
         environment_steps=0,
-        rows=cells(episodes, best, DmilConfig()),
+        rows=summary_rows(episodes, best, DmilConfig()),
         seconds={},
         sub_skills={},
         protocol="p",

@@ -15,8 +15,8 @@ from services.experiments.finished_run import FinishedRun
 from services.reporting import sub_skill_report
 from services.reporting.choices import DEMONSTRATIONS, ROLLOUTS, Choices, Timeline, choices_on
 from services.reporting.drawing import COLOURS, Picture, colour_of, ink_on
-from services.reporting.lineup import line_up, policies
 from services.reporting.page import DataTable
+from services.reporting.run_group import group_runs, policies
 from services.reporting.sub_skill_pictures import draw_timelines, draw_transitions, draw_usage
 from services.reporting.sub_skills import sub_skill_sections
 
@@ -40,8 +40,8 @@ def colours_in(svg: str) -> set[str]:
 @pytest.mark.parametrize("method", ["dmil", "option-gail-offline", "option-gail", "mlsh"])
 def test_every_method_with_sub_skills_has_a_policy_before_adaptation(trained: Trained, method: str):
     run = trained("run", method)
-    lineup = line_up({"run": run})
-    support, others = lineup.shots(TASK, 1)
+    group = group_runs({"run": run})
+    support, others = group.shots(TASK, 1)
     parameters = {name: array.copy() for name, array in run.checkpoint.parameters.items()}
     before, after = policies(run, support).values()
     for policy in (before, after):
@@ -59,7 +59,7 @@ def test_every_method_with_sub_skills_has_a_policy_before_adaptation(trained: Tr
 
 def test_before_adaptation_it_is_the_meta_trained_policy_itself(trained: Trained):
     run = trained("run")
-    support, others = line_up({"run": run}).shots(TASK, 1)
+    support, others = group_runs({"run": run}).shots(TASK, 1)
     experiment = run.experiment
     method = experiment.method(experiment.training_sets(run.demonstrations))
     parameters = experiment.initial_parameters(method)
@@ -77,7 +77,7 @@ def test_rollouts_are_episodes_of_the_evaluation(trained: Trained, tmp_path: Pat
     run.experiment.evaluate(LocalRunner(run.experiment.suite), run.demonstrations, run.checkpoint, tmp_path / "rows")
     rows = read_rows(tmp_path / "rows" / "episodes.jsonl", EpisodeResult)
     evaluated = [row for row in rows if row.task == TASK and row.draw == 0]
-    _, after = choices_on(line_up({"run": run}), TASK, 1, 2)
+    _, after = choices_on(group_runs({"run": run}), TASK, 1, 2)
     drawn = after.timelines[ROLLOUTS]
     assert [timeline.name.split()[0] for timeline in drawn] == [str(row.episode) for row in evaluated] == ["0", "2"]
     assert [timeline.name.endswith("solved") for timeline in drawn] == [row.success for row in evaluated]
@@ -87,27 +87,27 @@ def test_rollouts_are_episodes_of_the_evaluation(trained: Trained, tmp_path: Pat
 
 def test_what_is_adapted_to_is_not_looked_at(trained: Trained):
     run = trained("run")
-    lineup = line_up({"run": run})
-    support, others = lineup.shots(TASK, 3)
-    held_out = [demonstration.id for demonstration in lineup.held_out[TASK]]
+    group = group_runs({"run": run})
+    support, others = group.shots(TASK, 3)
+    held_out = [demonstration.id for demonstration in group.held_out[TASK]]
     assert [d.id for d in support] + [d.id for d in others] == held_out
     assert len(held_out) == 8
     with pytest.raises(UserError, match="got 8; wanted fewer than the 8 held-out"):
-        lineup.shots(TASK, 8)
+        group.shots(TASK, 8)
 
 
 def test_a_policy_that_has_diverged_has_no_rollouts_and_the_page_says_so(trained: Trained):
     run = trained("run", evaluation={"learning_rate": 1e30})
-    lineup = line_up({"run": run})
-    (section,) = sub_skill_sections(lineup, rollouts=1)
-    assert choices_on(lineup, TASK, 1, 1)[1].timelines[ROLLOUTS] == []
+    group = group_runs({"run": run})
+    (section,) = sub_skill_sections(group, rollouts=1)
+    assert choices_on(group, TASK, 1, 1)[1].timelines[ROLLOUTS] == []
     pictures = [part for part in section.parts if isinstance(part, Picture)]
     assert any("the policy has diverged" in picture.svg for picture in pictures)
 
 
 def test_methods_without_sub_skills_get_no_section(trained: Trained):
-    lineup = line_up({"flat": trained("flat", "behaviour-cloning"), "one": trained("one", method={"sub_skills": 1})})
-    assert sub_skill_sections(lineup) == []
+    group = group_runs({"flat": trained("flat", "behaviour-cloning"), "one": trained("one", method={"sub_skills": 1})})
+    assert sub_skill_sections(group) == []
 
 
 def test_timelines_have_colours_numbers_and_names_of_both_adaptations():
@@ -157,8 +157,8 @@ def test_numbers_are_legible_on_every_colour():
 
 
 def test_tables_hold_what_the_pictures_show(trained: Trained):
-    lineup = line_up({"A": trained("run"), "B": trained("other", method={"sub_skills": 5})})
-    (section,) = sub_skill_sections(lineup, rollouts=2)
+    group = group_runs({"A": trained("run"), "B": trained("other", method={"sub_skills": 5})})
+    (section,) = sub_skill_sections(group, rollouts=2)
     use, transitions = (part for part in section.parts if isinstance(part, DataTable))
     assert len(use.rows) == 8
     for row in use.rows:

@@ -8,7 +8,7 @@ import pytest
 
 from services import report
 from services.experiments.finished_run import FinishedRun
-from services.sweeps.compare import runs_compared
+from services.reporting.comparison import compare_runs
 from tests.services.reporting.made_runs import make_run
 from tests.services.sweeps.made_up import better, make
 
@@ -44,7 +44,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def compared(*names: str, baseline: str | None = None):
-    return runs_compared([FinishedRun.found(name, Path("runs")) for name in names], baseline)
+    return compare_runs([FinishedRun.found(name, Path("runs")) for name in names], baseline)
 
 
 ALL = [f"{method}-seed-{seed}" for method in METHODS for seed in (0, 1)]
@@ -105,7 +105,7 @@ def test_runs_that_differ_only_in_the_seed_are_one_row_and_the_same_seed_again_i
     make_run(place / "runs" / "again-1", lambda *of: False, seed=1)
     comparison = compared(*ALL, "again-0", "again-1")
     assert list(comparison.rows) == ["dmil", "mil", "again"]
-    assert [(of.row, of.name, of.seed) for of in comparison.contenders if of.row == "again"] == [
+    assert [(of.row, of.name, of.seed) for of in comparison.evaluations if of.row == "again"] == [
         ("again", "again-0", 0), ("again", "again-1", 1)
     ]  # fmt: skip
     assert {tuple(cell.seeds) for cell in comparison.cells} == {(0, 1)}

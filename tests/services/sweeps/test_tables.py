@@ -11,7 +11,7 @@ import pytest
 from dmil_core.errors import UserError
 from dmil_core.settings import sub_skills_of
 from services import report
-from services.evaluation.comparison import Place
+from services.evaluation.comparison import CellKey
 from services.sweeps.folders import TrialResult
 from services.sweeps.table_formats import write_tables
 from services.sweeps.tables import comparison_of, tables_of
@@ -217,8 +217,8 @@ def test_report_tables_finds_a_sweep_by_name(tmp_path: Path, capsys: pytest.Capt
 
 def test_outcomes_keep_their_order(tmp_path: Path) -> None:
     sweep = make(tmp_path, lambda *of: float(of[4] == "push" and of[5] == of[1]))
-    outcomes = comparison_of(sweep).outcomes[Place("DMIL", "ml10", "meta-testing", 3)]
-    for seed, tried in outcomes.items():
+    outcomes = comparison_of(sweep).outcomes[CellKey("DMIL", "ml10", "meta-testing", 3)]
+    for seed, seed_outcomes in outcomes.items():
         wanted = np.zeros((2, EPISODES))
         wanted[sorted(TASKS).index("push"), seed] = 1
-        np.testing.assert_array_equal(tried.outcomes, wanted)
+        np.testing.assert_array_equal(seed_outcomes.outcomes, wanted)

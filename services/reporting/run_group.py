@@ -30,7 +30,7 @@ class Shots(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Lineup:
+class RunGroup:
     """Runs by their labels, and what they are looked at on."""
 
     runs: Mapping[str, FinishedRun]
@@ -54,7 +54,7 @@ class Lineup:
         return Shots(held_out[:count], held_out[count:][:others])
 
 
-def line_up(runs: Mapping[str, FinishedRun], tasks: Sequence[str] | None = None) -> Lineup:
+def group_runs(runs: Mapping[str, FinishedRun], tasks: Sequence[str] | None = None) -> RunGroup:
     """Put runs side by side on some tasks.
 
     The tasks are of their kind of robot, the runs' own or others; the first run's meta-testing tasks, at most
@@ -75,7 +75,7 @@ def line_up(runs: Mapping[str, FinishedRun], tasks: Sequence[str] | None = None)
         experiment = Experiment(run.config.model_copy(update={"suite": suite}), run.experiment.store)
         data = experiment.collect(LocalRunner(experiment.suite))
     held_out = experiment.held_out_sets(data)
-    return Lineup(runs, experiment, {task: held_out[task] for task in wanted})
+    return RunGroup(runs, experiment, {task: held_out[task] for task in wanted})
 
 
 def _check_alike(first: str, run: FinishedRun, label: str, other: FinishedRun) -> None:
