@@ -80,27 +80,29 @@ class _Shortened(reprlib.Repr):
 _shortened = _Shortened()
 
 
-def shown(value: object) -> str:
+def shorten(value: object) -> str:
     """Return a value as it stands in a message: `repr`, cut short however large the value is."""
     return _shortened.repr(value)
 
 
-def explain(error: ValidationError, whole: str = "settings") -> str:
-    """Return one line for each wrong value, of the first ones: the key, what it got, and what was wanted.
+def describe_errors(error: ValidationError, whole: str = "settings", separator: str = "\n") -> str:
+    """Return each wrong value, of the first ones: the key, what it got, and what was wanted.
 
     Args:
         error: of a model of pydantic's.
         whole: what to name where no key is to blame.
+        separator: what stands between two of them.
     """
     problems = error.errors(include_url=False)
     lines: list[str] = []
     for problem in problems[:MOST_LINES]:
         where = ".".join(map(str, problem["loc"])) or whole
         message = problem["msg"].removeprefix("Value error, ")
-        # A validator of our own names the key, the value and what was wanted by itself.
-        own = problem["type"] == "value_error"
         short = where if len(where) <= 100 else f"{where[:50]}...{where[-50:]}"
-        lines.append(message if own else f"{short}: got {shown(problem['input'])}; {message[0].lower()}{message[1:]}")
+        if problem["type"] == "value_error":  # a validator of ours names key, value and what was wanted by itself
+            lines.append(message)
+        else:
+            lines.append(f"{short}: got {shorten(problem['input'])}; {message[0].lower()}{message[1:]}")
     if len(problems) > MOST_LINES:
         lines.append(f"and {len(problems) - MOST_LINES} more")
-    return "\n".join(lines)
+    return separator.join(lines)

@@ -23,7 +23,7 @@ import psutil
 import tyro
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from dmil_core.errors import RunError, UserError, explain
+from dmil_core.errors import RunError, UserError, describe_errors
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.storage.files import read_file, write_file
@@ -116,7 +116,7 @@ class Record(BaseModel):
         try:
             return Record.model_validate_json(read_file(path, MOST_BYTES))
         except (OSError, ValidationError) as error:
-            got = explain(error) if isinstance(error, ValidationError) else str(error)
+            got = describe_errors(error) if isinstance(error, ValidationError) else str(error)
             raise UserError(
                 f"{path}: got {'; '.join(got.splitlines())}; wanted the note of what was started; look for it with "
                 "`ps`, end it, and remove the file"

@@ -15,7 +15,7 @@ import tyro
 from pydantic import ValidationError
 
 from dmil_core.configs import DEFAULT_METHOD, ExperimentConfig
-from dmil_core.errors import UserError, explain
+from dmil_core.errors import UserError, describe_errors
 from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import DEFAULT_PRESET, EARLY, defaults_from
 from services.cli.places import announce
@@ -159,7 +159,7 @@ def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]
     try:
         before = ExperimentConfig.model_validate_json(read_file(folder / MARK, MOST_BYTES))
     except (OSError, ValidationError) as error:
-        got = explain(error) if isinstance(error, ValidationError) else error
+        got = describe_errors(error) if isinstance(error, ValidationError) else error
         raise UserError(f"{folder / 'config.json'}: {got}; start a new run") from error
     given = parse(Arguments, __doc__ or "", arguments, Arguments(before))
     _same_run(before, given.experiment)

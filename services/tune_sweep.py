@@ -15,7 +15,7 @@ from typing import Annotated
 import tyro
 from pydantic import ValidationError
 
-from dmil_core.errors import RunError, UserError, explain
+from dmil_core.errors import RunError, UserError, describe_errors
 from services.cli.arguments import Quiet, exit_code, parse
 from services.cli.places import announce
 from services.cli.progress import Clock, console
@@ -124,7 +124,7 @@ def _read(file: Path) -> Sweep:
     try:
         return Sweep.model_validate(read_yaml(file, "SWEEP"))
     except ValidationError as error:
-        raise UserError("\n".join(f"{file}: {line}" for line in explain(error).splitlines())) from error
+        raise UserError("\n".join(f"{file}: {line}" for line in describe_errors(error).splitlines())) from error
 
 
 def _begun(given: Arguments) -> SweepFolder:
@@ -136,7 +136,7 @@ def _begun(given: Arguments) -> SweepFolder:
     try:
         sweep = _read(file).at(given.preset, given.suites or (), given.seeds or ())
     except ValidationError as error:
-        raise UserError("\n".join(f"--{line}" for line in explain(error).splitlines())) from error
+        raise UserError("\n".join(f"--{line}" for line in describe_errors(error).splitlines())) from error
     for value, flag in ((sweep.suites, "--suites"), (sweep.seeds, "--seeds")):
         if len(set(value)) < len(value):
             raise UserError(f"{flag}: got {' '.join(map(str, value))}; wanted each once")

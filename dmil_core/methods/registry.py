@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from dmil_core.errors import UserError, shown
+from dmil_core.errors import UserError, shorten
 from dmil_core.methods.base import Method
 from dmil_core.methods.behaviour_cloning.method import BehaviourCloning
 from dmil_core.methods.dmil.method import Dmil
@@ -53,7 +53,7 @@ def method_type(name: object) -> type[Method[Any]]:
             return OURS[name]
         if name in registered:
             return _loaded(registered[name])
-    raise UserError(f"method.name: got {shown(name)}; wanted one of {', '.join(method_names())}")
+    raise UserError(f"method.name: got {shorten(name)}; wanted one of {', '.join(method_names())}")
 
 
 def config_type(name: object) -> type[MethodConfig]:
@@ -84,7 +84,7 @@ def _loaded(point: Any) -> type[Method[Any]]:
     found = imported(point, "method.name")
     if not (isinstance(found, type) and issubclass(found, Method)):
         raise UserError(
-            f"method.name: got {point.name}, {point.value}: got {shown(found)}; wanted a class derived from Method; "
-            f"see {GUIDE}"
+            f"method.name: got {point.name}, {point.value}: got {shorten(found)}; wanted a class derived from "
+            f"Method; see {GUIDE}"
         )
     return found

@@ -11,7 +11,7 @@ from typing import Annotated, Any, NoReturn, TypeVar
 import tyro
 from pydantic import ValidationError
 
-from dmil_core.errors import RunError, UserError, explain
+from dmil_core.errors import RunError, UserError, describe_errors
 from services.cli.progress import console_logging
 
 T = TypeVar("T")
@@ -51,7 +51,7 @@ def parse(program: type[T], description: str, arguments: Sequence[str], defaults
     try:
         return tyro.cli(program, prog=f"python -m {module}", args=arguments, description=description, default=defaults)
     except ValidationError as error:
-        raise UserError(explain(error)) from error
+        raise UserError(describe_errors(error)) from error
 
 
 def exit_code(program: Callable[[Sequence[str]], None], arguments: Sequence[str]) -> int:

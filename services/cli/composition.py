@@ -16,7 +16,7 @@ from dmil_core.configs import (
     SuiteConfig,
     preset_of,
 )
-from dmil_core.errors import UserError, explain, shown
+from dmil_core.errors import UserError, describe_errors, shorten
 from services.cli.yaml_files import merged, read_yaml
 
 DEFAULT_SUITE, DEFAULT_PRESET = "ml10", "quick"
@@ -89,7 +89,7 @@ def suite_settings(suite: str, tasks: Sequence[str] | None = None) -> SuiteConfi
 
 
 def _no_name(suite: str | None) -> UserError:
-    return UserError(f"--suite: got {shown(suite)}; wanted a name of letters, digits and hyphens, as ml10")
+    return UserError(f"--suite: got {shorten(suite)}; wanted a name of letters, digits and hyphens, as ml10")
 
 
 def with_evaluation(config: ExperimentConfig, evaluation: EvaluationConfig) -> ExperimentConfig:
@@ -110,4 +110,4 @@ def checked(settings: dict[str, Any], origin: str = "") -> ExperimentConfig:
     try:
         return ExperimentConfig.model_validate(settings)
     except ValidationError as error:
-        raise UserError("\n".join(f"{origin}{line}" for line in explain(error).splitlines())) from error
+        raise UserError("\n".join(f"{origin}{line}" for line in describe_errors(error).splitlines())) from error

@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from dmil_core.errors import UserError, shown
+from dmil_core.errors import UserError, shorten
 from services.storage.files import read_file
 
 MOST_BYTES = 2**16
@@ -25,11 +25,11 @@ def merged(settings: Mapping[str, Any], given: Mapping[Any, Any], origin: str, p
     found = dict(settings)
     for key, value in given.items():
         if key not in found:
-            named = key if isinstance(key, str) and len(key) < 50 else shown(key)
+            named = key if isinstance(key, str) and len(key) < 50 else shorten(key)
             raise UserError(f"{origin}: got the unknown key {prefix}{named}; wanted one of {', '.join(found)}")
         if isinstance(found[key], dict):
             if not isinstance(value, dict):
-                raise UserError(f"{origin}: {prefix}{key}: got {shown(value)}; wanted keys: {', '.join(found[key])}")
+                raise UserError(f"{origin}: {prefix}{key}: got {shorten(value)}; wanted keys: {', '.join(found[key])}")
             value = merged(found[key], value, origin, f"{prefix}{key}.")
         found[key] = value
     return found

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from dmil_core.demonstrations import Demonstration, DemonstrationError
-from dmil_core.errors import shown
+from dmil_core.errors import shorten
 from services.storage.files import read_file
 
 FORMS = {"observations": ("f", 2), "actions": ("f", 2), "episode_lengths": ("iu", 1), "tasks": ("U", 1)}
@@ -80,7 +80,7 @@ def _check_lengths(lengths: np.ndarray, observations: int, actions: int) -> None
     few = 1 <= len(lengths) <= MOST_DEMONSTRATIONS
     if not few or (lengths < 1).any() or (lengths > observations).any() or not lengths.sum() == observations == actions:
         raise DemonstrationError(
-            f"episode_lengths: got {shown(lengths[:10].tolist())} for {observations} observations and {actions} "
+            f"episode_lengths: got {shorten(lengths[:10].tolist())} for {observations} observations and {actions} "
             f"actions; wanted as many of both as the lengths together, each at least 1, of 1 to {MOST_DEMONSTRATIONS} "
             "demonstrations"
         )
@@ -108,7 +108,7 @@ def _check_members(members: list[zipfile.ZipInfo]) -> None:
     names = [member.filename for member in members]
     wanted = {f"{name}.npy" for name in FORMS}
     if len(set(names)) != len(names) or not {f"{name}.npy" for name in FORMS.keys() - OPTIONAL} <= set(names) <= wanted:
-        raise DemonstrationError(f"got the members {shown(names)}; wanted {', '.join(sorted(wanted))}, each once")
+        raise DemonstrationError(f"got the members {shorten(names)}; wanted {', '.join(sorted(wanted))}, each once")
     for member in members:
         if member.flag_bits & 1 or member.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
             raise DemonstrationError(

@@ -26,7 +26,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from dmil_core.configs import DemonstrationConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError, digest
-from dmil_core.errors import explain
+from dmil_core.errors import describe_errors
 from dmil_core.trajectories import Episode
 from services.storage.checksums import check_listing, write_listing
 from services.storage.files import inside, read_file, room_for, sync
@@ -108,7 +108,7 @@ class DemoStore:
                 for index, (observations, actions) in enumerate(_read_episodes(path / ARRAYS, metadata.total_episodes))
             )
         except ValidationError as error:
-            raise self._damaged(path / METADATA, "; ".join(explain(error, "metadata").splitlines())) from error
+            raise self._damaged(path / METADATA, describe_errors(error, "metadata", "; ")) from error
         except DemonstrationError as error:
             raise DemonstrationError(f"{path / ARRAYS}: {error}") from error
         except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:  # the last four are h5py's

@@ -8,7 +8,7 @@ from typing import Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from dmil_core.errors import UserError, explain
+from dmil_core.errors import UserError, describe_errors
 from services.storage.files import read_file, write_file
 from services.suites.base import Split
 
@@ -99,7 +99,7 @@ def read_rows(path: Path, model: type[Row]) -> list[Row]:
         try:
             rows.append(model.model_validate_json(line, strict=True))
         except ValidationError as error:
-            got = "; ".join(explain(error, "row").splitlines())
+            got = describe_errors(error, "row", "; ")
             raise UserError(f"{path}:{number}: {got}; wanted a whole {model.__name__}; make the file again") from error
     return rows
 

@@ -4,17 +4,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from dmil_core.configs import ExperimentConfig
-from dmil_core.errors import UserError, explain
+from dmil_core.errors import UserError
 from services.demonstrations.store import TaskDemonstrations, open_store
 from services.distributed.runner import LocalRunner
 from services.evaluation.results import EpisodeResult, EvaluationFolder, read_rows
 from services.evaluation.summary import Summary
 from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoint, Checkpoints
-from services.storage.files import read_file
+from services.storage.files import read_json
 from services.storage.run_folders import find_folder
 from services.tracking.history import Origin, read_metrics, read_origin
 
@@ -64,14 +62,8 @@ class FinishedRun(EvaluationFolder):
         Raises:
             UserError: if the file is not as a run writes it.
         """
-        path = self.folder / MARK
-        try:
-            return Summary.model_validate_json(read_file(path, MOST_BYTES))
-        except ValidationError as error:
-            raise UserError(
-                f"{path}: got {'; '.join(explain(error).splitlines())}; wanted what a run writes at its end; "
-                f"write it again: python -m services.meta_train --resume {self.folder}"
-            ) from error
+        advice = f"write it again: python -m services.meta_train --resume {self.folder}"
+        return read_json(self.folder / MARK, Summary, MOST_BYTES, f"wanted what a run writes at its end; {advice}")
 
     @cached_property
     def checkpoint(self) -> Checkpoint:

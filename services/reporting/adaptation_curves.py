@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from dmil_core.configs import EvaluationConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError
-from dmil_core.errors import UserError, explain
+from dmil_core.errors import UserError
 from dmil_core.statistics import Mean, interval_text, success_rate
 from services.cli.composition import with_evaluation
 from services.cli.progress import Bar, console
@@ -30,7 +30,7 @@ from services.reporting.drawing import (
 )
 from services.reporting.page import DataTable, Part, Prose, Section
 from services.reporting.run_group import MOST_TASKS, policy_after
-from services.storage.files import read_file, write_file
+from services.storage.files import read_json, write_file
 
 FOLDER, PLAN, IMITATION = "adaptation", "plan.json", "imitation.jsonl"
 SHOTS = (1, 3, 5, 10)
@@ -200,13 +200,8 @@ def _plan_of(run: FinishedRun) -> CurvePlan | None:
     path = run.folder / FOLDER / PLAN
     if not path.exists():
         return None
-    try:
-        plan = CurvePlan.model_validate_json(read_file(path, MOST_BYTES))
-    except ValidationError as error:
-        raise UserError(
-            f"{path}: got {'; '.join(explain(error).splitlines())}; wanted what measuring adaptation writes; remove it "
-            "and measure again"
-        ) from error
+    advice = "wanted what measuring adaptation writes; remove it and measure again"
+    plan = read_json(path, CurvePlan, MOST_BYTES, advice)
     return plan if plan.checkpoint == run.checkpoint.digest else None
 
 

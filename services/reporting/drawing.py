@@ -7,12 +7,9 @@ from io import StringIO
 from itertools import count
 from typing import Any, NamedTuple
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
 from markupsafe import Markup, escape
-from matplotlib import pyplot
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -41,7 +38,6 @@ STYLE: dict[Any, Any] = {
     "grid.alpha": 0.2,
     "font.size": 9.0,
     "axes.titlesize": 10.0,
-    "figure.max_open_warning": 0,
 } | dict.fromkeys(
     ("text.color", "axes.labelcolor", "axes.edgecolor", "axes.titlecolor", "xtick.color", "ytick.color", "grid.color"),
     INK,
@@ -92,13 +88,13 @@ def scale_by_logarithms(axis: Axes) -> None:
 def panels(
     rows: int = 1, columns: int = 1, *, width: float = 7.0, height: float = 3.0
 ) -> Iterator[tuple[Figure, list[Axes]]]:
-    """Give a figure with a grid of axes, `width` by `height` inches of 72 points in all, and forget it at the end."""
-    with pyplot.rc_context(STYLE):
-        figure, axes = pyplot.subplots(rows, columns, figsize=(width, height), layout="constrained", squeeze=False)
-        try:
-            yield figure, list(axes.flat)
-        finally:
-            pyplot.close(figure)
+    """Give a figure with a grid of axes, `width` by `height` inches of 72 points in all, in the style of all pictures.
+
+    It is no figure of pyplot's, so that no backend is set for a process that draws in windows of its own.
+    """
+    with rc_context(STYLE):
+        figure = Figure((width, height), layout="constrained")
+        yield figure, list(figure.subplots(rows, columns, squeeze=False).flat)
 
 
 def drawn(figure: Figure, title: str, description: str) -> Picture:

@@ -4,12 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
 import numpy as np
 from jaxtyping import UInt8
-from matplotlib import pyplot
+from matplotlib.figure import Figure
 
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
 from dmil_core.errors import UserError
@@ -68,12 +65,12 @@ def draw_gallery(suite: TaskSuite, camera: str | View, seed: int, path: Path, co
     """
     tasks = list(dict.fromkeys((*suite.train_tasks, *suite.test_tasks)))
     rows = -(-len(tasks) // columns)
-    size = 2 * columns, 1.75 * rows
-    figure, axes = pyplot.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
-    for axis in axes.flat:
+    figure = Figure((2 * columns, 1.75 * rows), layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for axis in axes:
         axis.set_axis_off()
     with Bar(f"drawing {suite.name}", len(tasks)) as bar:
-        for axis, task in zip(axes.flat, tasks, strict=False):
+        for axis, task in zip(axes, tasks, strict=False):
             axis.imshow(_at_work(suite, camera, task, seed))
             tested = task in suite.test_tasks
             title = _in_lines(task) + "\n(meta-testing)" * tested
@@ -81,7 +78,6 @@ def draw_gallery(suite: TaskSuite, camera: str | View, seed: int, path: Path, co
             bar.advance(1, task)
     with room_for(path, MOST_BYTES):
         figure.savefig(path, dpi=110, pil_kwargs={"quality": 85})
-    pyplot.close(figure)
 
 
 def _in_lines(task: str) -> str:

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from dmil_core.errors import UserError, shown
+from dmil_core.errors import UserError, shorten
 from dmil_core.settings import sub_skills_of
 from services.cli.arguments import parse
 from services.cli.progress import console
@@ -69,7 +69,7 @@ def _row_of(finished: FinishedRun, given: Arguments) -> EpisodeResult:
     rows = finished.episodes
     tasks = dict.fromkeys(row.task for row in rows)
     if given.task not in tasks:
-        raise UserError(f"--task: got {shown(given.task)}; wanted one of {finished.name}'s: {', '.join(tasks)}")
+        raise UserError(f"--task: got {shorten(given.task)}; wanted one of {finished.name}'s: {', '.join(tasks)}")
     rows = [row for row in rows if row.task == given.task]
     shots = sorted({row.shots for row in rows})
     if given.shots not in shots:

@@ -16,7 +16,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from dmil_core.configs import ExperimentConfig
-from dmil_core.errors import UserError, explain, shown
+from dmil_core.errors import UserError, describe_errors, shorten
 from dmil_core.methods.base import Method
 from dmil_core.methods.registry import method_type
 from dmil_core.networks import Parameters, flatten, unflatten
@@ -78,7 +78,7 @@ class Manifest(BaseModel):
     @classmethod
     def _can_be_held(cls, shapes: dict[str, Shape]) -> dict[str, Shape]:
         if odd := [name for name, shape in shapes.items() if name.endswith(".weight") and len(shape) < 2]:
-            raise ValueError(f"shapes: got {shapes[odd[0]]} for {shown(odd[0])}; wanted a matrix")
+            raise ValueError(f"shapes: got {shapes[odd[0]]} for {shorten(odd[0])}; wanted a matrix")
         if (total := 4 * sum(map(math.prod, shapes.values()))) > MOST_TENSORS:
             raise ValueError(f"shapes: got {total} bytes of parameters; wanted at most {MOST_TENSORS}")
         return shapes
@@ -135,12 +135,12 @@ class Checkpoint:
         except (SafetensorError, KeyError, ValueError, TypeError, OverflowError) as error:  # KeyError: an odd dtype
             raise self._damaged(name, f"{type(error).__name__}, {str(error)[:200]}", "safetensors") from error
         if odd := [key for key, tensor in tensors.items() if tensor.dtype != np.float32]:
-            raise self._damaged(name, f"{tensors[odd[0]].dtype} in {shown(odd[0])}", "float32 only")
+            raise self._damaged(name, f"{tensors[odd[0]].dtype} in {shorten(odd[0])}", "float32 only")
         if shapes is None:
             return tensors
         found = {key: tensor.shape for key, tensor in tensors.items()}
         if found != {key: tuple(shape) for key, shape in shapes.items()}:
-            raise self._damaged(name, f"tensors {shown(found)}", f"the manifest's {shown(dict(shapes))}")
+            raise self._damaged(name, f"tensors {shorten(found)}", f"the manifest's {shorten(dict(shapes))}")
         return {key: tensors[key] for key in shapes}
 
     def _damaged(self, name: str, got: str, wanted: str) -> CheckpointError:
@@ -284,7 +284,7 @@ def _read_manifest(path: Path) -> Manifest:
             raise OSError(f"a file whose SHA-256 is not the one in {MARKER}")
         manifest = Manifest.model_validate_json(text)
     except (OSError, ValidationError) as error:
-        got = _describe(error) if isinstance(error, OSError) else "; ".join(explain(error, "manifest").splitlines())
+        got = _describe(error) if isinstance(error, OSError) else describe_errors(error, "manifest", "; ")
         raise CheckpointError(
             f"{path / MANIFEST}: got {got}; wanted a checkpoint's manifest; use another checkpoint"
         ) from error

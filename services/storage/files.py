@@ -7,8 +7,13 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
-from dmil_core.errors import RunError
+from pydantic import BaseModel, ValidationError
+
+from dmil_core.errors import RunError, UserError, describe_errors
+
+Model = TypeVar("Model", bound=BaseModel)
 
 FULL = {errno.ENOSPC, errno.EDQUOT}
 FULL_IN_WORDS = ("No space left on device", "Disk quota exceeded", "os error 28", "errno = 28")
@@ -104,3 +109,15 @@ def inside(root: Path, name: str) -> Path:
     if not path.is_relative_to(root.resolve()):
         raise OSError(errno.EPERM, f"lies outside {root}", name)
     return path
+
+
+def read_json(path: Path, model: type[Model], most: int, advice: str) -> Model:
+    """Read a JSON file of at most `most` bytes into a model of pydantic's.
+
+    Raises:
+        UserError: names the file and what is wrong in it, with `advice`: what was wanted and what to do.
+    """
+    try:
+        return model.model_validate_json(read_file(path, most))
+    except ValidationError as error:
+        raise UserError(f"{path}: got {describe_errors(error, separator='; ')}; {advice}") from error

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from dmil_core.errors import UserError, shown
+from dmil_core.errors import UserError, shorten
 from services.storage.files import inside
 
 
@@ -15,7 +15,7 @@ def new_folder(name: str, runs: Path, mark: str) -> Path:
         UserError: if the name is none, or taken.
     """
     if name in (".", "..") or Path(name).name != name:
-        raise UserError(f"--name: got {shown(name)}; wanted the name of a folder in {runs}, without any /")
+        raise UserError(f"--name: got {shorten(name)}; wanted the name of a folder in {runs}, without any /")
     folder = _held(runs / name, runs, "--name")
     if (folder / mark).exists():
         raise UserError(f"--name: got {folder}, which is taken; wanted a new name, or --resume {folder}")
@@ -31,7 +31,7 @@ def find_folder(name: str, runs: Path, mark: str, flag: str = "--resume") -> Pat
     for folder in (Path(name), runs / name):
         if (folder / mark).is_file():
             return _held(folder, runs, flag)
-    raise UserError(f"{flag}: got {shown(name)}; wanted a folder with a {mark} in it, or the name of one in {runs}")
+    raise UserError(f"{flag}: got {shorten(name)}; wanted a folder with a {mark} in it, or the name of one in {runs}")
 
 
 def _held(folder: Path, runs: Path, flag: str) -> Path:

@@ -4,6 +4,7 @@ import contextlib
 import io
 from collections.abc import Sequence
 from itertools import combinations
+from threading import Lock
 from typing import Any
 
 import gymnasium
@@ -73,7 +74,20 @@ class SharedModelRobot(kitchen_env.FrankaRobot):
         return kitchen_model(), mujoco.MjData(kitchen_model())
 
 
-kitchen_env.FrankaRobot = SharedModelRobot  # its environment has no other way to be given one
+_building = Lock()
+
+
+def _kitchen_env(chain: Sequence[str]) -> kitchen_env.KitchenEnv:
+    """Build gymnasium-robotics' environment with the shared model.
+
+    Its constructor takes no robot, so the module's own class stands back for ours while it runs.
+    """
+    with _building:
+        stock, kitchen_env.FrankaRobot = kitchen_env.FrankaRobot, SharedModelRobot
+        try:
+            return kitchen_env.KitchenEnv([NAMES[sub_task] for sub_task in chain])
+        finally:
+            kitchen_env.FrankaRobot = stock
 
 
 class KitchenTask(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -95,7 +109,7 @@ class KitchenTask(gymnasium.Env[np.ndarray, np.ndarray]):
             chain: sub-tasks, keys of `NAMES`.
             start_noise: how far starts differ, in units of `START_ANGLE` and `START_KETTLE`.
         """
-        self._env = kitchen_env.KitchenEnv([NAMES[sub_task] for sub_task in chain])
+        self._env = _kitchen_env(chain)
         self.model, self.data = self._env.model, self._env.data
         self._rest = self._env.robot_env.init_qpos
         self._spread = start_noise * np.array([START_ANGLE] * 7 + [START_KETTLE] * 2)
@@ -109,15 +123,15 @@ class KitchenTask(gymnasium.Env[np.ndarray, np.ndarray]):
         kettle in metres.
         """
         super().reset(seed=seed)
-        drawn = self.np_random.uniform(-self._spread, self._spread)
+        shift = self.np_random.uniform(-self._spread, self._spread)
         start = self._rest.copy()
-        start[[*range(7), 23, 24]] += drawn
+        start[[*range(7), 23, 24]] += shift
         if options is not None and "state" in options:
             start = np.array(options["state"], np.float64)
-            drawn = (start - self._rest)[[*range(7), 23, 24]]
+            shift = (start - self._rest)[[*range(7), 23, 24]]
         self._env.robot_env.init_qpos = start
         observation, _ = self._env.reset(seed=int(self.np_random.integers(2**31)))
-        return state(observation["observation"]), {"goal": drawn.tolist(), "score": 0, "completed": []}
+        return state(observation["observation"]), {"goal": shift.tolist(), "score": 0, "completed": []}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         """Advance by 0.08 s; info holds ``success``, the ``score`` and the names of the sub-tasks ``completed``."""

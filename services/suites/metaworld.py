@@ -59,9 +59,6 @@ WITHOUT_DISTANCE = {"assembly", "box-close", "disassemble", "door-open", "hammer
 """Tasks whose info has a zero for the distance to the goal, or, in lever-pull, the distance from hand to lever."""
 
 
-warnings.filterwarnings("ignore", message=r"Constant\(s\) may be too high")  # whoever acts clips the actions
-
-
 class SeededEpisodes(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
     """Makes ``reset(seed=...)`` mean what gymnasium says, and reports what it drew; Meta-World ignores the seed."""
 
@@ -155,5 +152,9 @@ class MetaWorldSuite:
         return env if self._goal_visible else HiddenGoal(env)
 
     def expert(self, task: str) -> Expert:
-        """Return Meta-World's own scripted policy, or ours for the task that it does not have."""
+        """Return Meta-World's own scripted policy, or ours for the task that it does not have.
+
+        Its warning of actions beyond [-1, 1] is ignored from here on: whoever acts clips them.
+        """
+        warnings.filterwarnings("ignore", message=r"Constant\(s\) may be too high")
         return PushAroundWallExpert() if task == "push-around-wall" else ENV_POLICY_MAP[f"{task}-v3"]()

@@ -14,12 +14,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal, TypeVar
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
 from dmil_core.configs import EvaluationConfig, ExperimentConfig
-from dmil_core.errors import UserError, explain
+from dmil_core.errors import UserError
 from services.storage.checksums import sha256
-from services.storage.files import inside, read_file, write_file
+from services.storage.files import inside, read_json, write_file
 from services.sweeps.settings import PlannedTrial, Preset, Sweep, planned
 
 Record = TypeVar("Record", bound=BaseModel)
@@ -128,8 +128,6 @@ def evaluated(home: Path, evaluation: EvaluationConfig, tasks: Sequence[str]) ->
 
 def _read(path: Path, model: type[Record]) -> Record:
     try:
-        return model.model_validate_json(read_file(path, MOST_BYTES))
+        return read_json(path, model, MOST_BYTES, "start the sweep again, what is trained stays")
     except OSError as error:
         raise UserError(f"{path}: got {error.strerror}; wanted a sweep's folder, as runs/NAME") from error
-    except ValidationError as error:
-        raise UserError(f"{path}: {explain(error)}; start the sweep again, what is trained stays") from error

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from dmil_core.demonstrations import Demonstration, DemonstrationError
-from dmil_core.errors import UserError, shown
+from dmil_core.errors import UserError, shorten
 
 
 class Question(NamedTuple):
@@ -42,7 +42,7 @@ def unpacked(given: Mapping[str, Any], obs_dim: int, action_dim: int) -> Questio
     """
     support = given.get("support")
     if not isinstance(support, Sequence | np.ndarray) or isinstance(support, str) or len(support) == 0:
-        raise UserError(f"support: got {shown(support)}; wanted a list of at least one demonstration")
+        raise UserError(f"support: got {shorten(support)}; wanted a list of at least one demonstration")
     observation = _numbers(given.get("observation"), "observation", (obs_dim,))
     if not np.isfinite(observation).all():
         raise UserError("observation: got numbers that are not finite; wanted real numbers only")
@@ -58,7 +58,7 @@ def _memory(given: Any) -> Int64[np.ndarray, " memory_dim"]:
     try:
         return np.asarray(given, np.int64)
     except (TypeError, ValueError) as error:
-        raise UserError(f"memory: got {shown(given)}; wanted whole numbers, as the step before returned") from error
+        raise UserError(f"memory: got {shorten(given)}; wanted whole numbers, as the step before returned") from error
 
 
 def _demonstration(given: Any, number: int, obs_dim: int, action_dim: int) -> Demonstration:
@@ -85,7 +85,7 @@ def _numbers(given: Any, name: str, wanted: tuple[int, ...]) -> np.ndarray:
         rows = [np.asarray(row, np.float32) for row in given] if len(wanted) == 2 else given
         found = np.asarray(rows, np.float32)
     except (TypeError, ValueError) as error:
-        raise UserError(f"{name}: got {shown(given)}; wanted {in_words}") from error
+        raise UserError(f"{name}: got {shorten(given)}; wanted {in_words}") from error
     if found.ndim != len(wanted) or found.shape[-1] != wanted[-1]:
         raise UserError(f"{name}: got the shape {found.shape}; wanted {in_words}")
     return found

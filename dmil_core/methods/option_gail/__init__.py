@@ -31,5 +31,5 @@ What the sources leave open, and what is chosen here:
 - *Pre-training.* How the appendix's authors pre-trained is not said; the original's 16 million steps are in the size
   ``paper``, at most half a million of them in ``quick``.
 - *Test.* So many epochs of hard EM on the support set, each one step of Adam on all of it with fresh Viterbi labels.
-  The discriminator and the critic rest: meta-testing tasks are not acted in before they are judged.
+  The discriminator and the critic rest: meta-testing tasks are not acted in before they are evaluated.
 """

@@ -41,7 +41,7 @@ def orthogonal(prefix: str, sizes: Sequence[int], rng: np.random.Generator) -> P
     return parameters
 
 
-class Played(NamedTuple):
+class OptionSteps(NamedTuple):
     """The steps of several trajectories, of the policy or demonstrated, and the option before and at each."""
 
     steps: Steps
@@ -49,12 +49,12 @@ class Played(NamedTuple):
     options: Int[Tensor, " steps"]
 
     @classmethod
-    def of(cls, steps: Steps, options: Int[Tensor, " steps"], start: int) -> "Played":
+    def of(cls, steps: Steps, options: Int[Tensor, " steps"], start: int) -> "OptionSteps":
         """Return steps with the option at each; `start` comes before the first of a trajectory."""
         return cls(steps, options_before(options, steps.lengths, start), options)
 
     @classmethod
-    def of_rollouts(cls, rollouts: Sequence[Rollout], normalise: Normalisation, start: int) -> "Played":
+    def of_rollouts(cls, rollouts: Sequence[Rollout], normalise: Normalisation, start: int) -> "OptionSteps":
         """Return the steps of rollouts, none of them empty, one after the other."""
         states = np.concatenate([rollout.observations[:-1] for rollout in rollouts])
         actions = np.concatenate([rollout.actions for rollout in rollouts])
@@ -63,16 +63,16 @@ class Played(NamedTuple):
         steps = Steps(torch.from_numpy(normalise(states)), torch.from_numpy(actions), lengths)
         return cls.of(steps, torch.from_numpy(options), start)
 
-    def at(self, index: Int[Tensor, " chosen"]) -> "Played":
+    def at(self, index: Int[Tensor, " chosen"]) -> "OptionSteps":
         """Return some of the steps, each a trajectory of its own."""
         states, actions = self.steps.states[index], self.steps.actions[index]
-        return Played(Steps(states, actions, torch.ones_like(index)), self.before[index], self.options[index])
+        return OptionSteps(Steps(states, actions, torch.ones_like(index)), self.before[index], self.options[index])
 
 
-def discriminator_logits(parameters: Parameters, played: Played, options: int) -> Float[Tensor, " steps"]:
+def discriminator_logits(parameters: Parameters, batch: OptionSteps, options: int) -> Float[Tensor, " steps"]:
     """Return d(s_t, a_t, o_{t−1}, o_t), the logit of a step being the policy's; `options` is K."""
-    outputs = mlp(network(parameters, "discriminator"), torch.cat([played.steps.states, played.steps.actions], 1))
-    return outputs.gather(1, (played.before * options + played.options)[:, None])[:, 0]
+    outputs = mlp(network(parameters, "discriminator"), torch.cat([batch.steps.states, batch.steps.actions], 1))
+    return outputs.gather(1, (batch.before * options + batch.options)[:, None])[:, 0]
 
 
 def discriminator_loss(of_policy: Float[Tensor, " steps"], of_expert: Float[Tensor, " others"]) -> Float[Tensor, ""]:
@@ -86,23 +86,26 @@ def imitation_rewards(logits: Float[Tensor, " steps"]) -> Float[Tensor, " steps"
 
 
 def discriminate(
-    moved: Parameters, played: Played, expert: Played, config: OptionGailConfig, generator: torch.Generator
+    moved: Parameters, batch: OptionSteps, expert: OptionSteps, config: OptionGailConfig, generator: torch.Generator
 ) -> dict[str, float]:
     """Teach the discriminator in place, each minibatch of the policy's steps against as many demonstrated ones."""
     losses, k = [], config.sub_skills
     descent = torch.optim.AdamW(
         named(moved, "discriminator."), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
     )
-    for index in _minibatches(len(played.options), config.minibatch, config.discriminator_passes, generator):
+    for index in _minibatches(len(batch.options), config.minibatch, config.discriminator_passes, generator):
         others = torch.randint(len(expert.options), (len(index),), generator=generator)
-        of_policy, of_expert = (discriminator_logits(moved, side, k) for side in (played.at(index), expert.at(others)))
+        of_policy, of_expert = (discriminator_logits(moved, side, k) for side in (batch.at(index), expert.at(others)))
         loss = discriminator_loss(of_policy, of_expert)
         losses.append(loss.item())
         descend(descent, loss)
     with torch.no_grad():
-        caught = (discriminator_logits(moved, played, k) > 0).float().mean().item()
-        believed = (discriminator_logits(moved, expert, k) < 0).float().mean().item()
-    return {"discriminator_loss": float(np.mean(losses)), "discriminator_accuracy": (caught + believed) / 2}
+        of_policy = (discriminator_logits(moved, batch, k) > 0).float().mean().item()
+        of_expert = (discriminator_logits(moved, expert, k) < 0).float().mean().item()
+    return {
+        "discriminator_loss": float(np.mean(losses)),
+        "discriminator_accuracy": (of_policy + of_expert) / 2,
+    }
 
 
 def _minibatches(count: int, size: int, passes: int, generator: torch.Generator) -> Iterator[Int[Tensor, " _"]]:
@@ -111,7 +114,7 @@ def _minibatches(count: int, size: int, passes: int, generator: torch.Generator)
         yield from torch.randperm(count, generator=generator).split(size)
 
 
-class Aims(NamedTuple):
+class Targets(NamedTuple):
     """What PPO goes by: the standardised advantages of both levels, and what the critic should say of V_L."""
 
     high: Float[Tensor, " steps"]
@@ -119,9 +122,9 @@ class Aims(NamedTuple):
     returns: Float[Tensor, " steps"]
 
 
-def low_values(parameters: Parameters, played: Played) -> Float[Tensor, " steps"]:
+def low_values(parameters: Parameters, batch: OptionSteps) -> Float[Tensor, " steps"]:
     """Return the critic's V_L(s_t, o_t)."""
-    return mlp(network(parameters, "critic"), played.steps.states).gather(1, played.options[:, None])[:, 0]
+    return mlp(network(parameters, "critic"), batch.steps.states).gather(1, batch.options[:, None])[:, 0]
 
 
 def high_values(
@@ -137,20 +140,20 @@ def high_values(
 
 
 @torch.no_grad()
-def aims_of(
+def ppo_targets(
     parameters: Parameters,
-    played: Played,
+    batch: OptionSteps,
     rewards: Float[Tensor, " steps"],
     beyond: Float[Tensor, "trajectories obs_dim"],
     config: OptionGailConfig,
-) -> Aims:
+) -> Targets:
     """Return what PPO goes by in a round.
 
     Values are of rewards less the round's mean. `beyond` is each trajectory's state after its last step, where both
     levels are valued by V_H: the next option is not yet drawn.
     """
-    ends = played.steps.lengths.cumsum(0) - 1
-    last_values = high_values(parameters, beyond, played.options[ends], config).numpy()
+    ends = batch.steps.lengths.cumsum(0) - 1
+    last_values = high_values(parameters, beyond, batch.options[ends], config).numpy()
     centred = (rewards - rewards.mean()).numpy()
     cuts = (ends[:-1] + 1).tolist()
 
@@ -162,10 +165,10 @@ def aims_of(
         ]
         return np.concatenate(each)
 
-    of_low = low_values(parameters, played).numpy()
-    high = advantages(high_values(parameters, played.steps.states, played.before, config).numpy())
+    of_low = low_values(parameters, batch).numpy()
+    high = advantages(high_values(parameters, batch.steps.states, batch.before, config).numpy())
     low = advantages(of_low)
-    return Aims(_standard(high), _standard(low), torch.from_numpy((low + of_low).astype(np.float32)))
+    return Targets(_standard(high), _standard(low), torch.from_numpy((low + of_low).astype(np.float32)))
 
 
 def _standard(values: np.ndarray) -> Float[Tensor, " steps"]:
@@ -183,33 +186,33 @@ class Decisions(NamedTuple):
     """Of π_H, in the mean."""
 
 
-def decisions(parameters: Parameters, played: Played, config: OptionGailConfig) -> Decisions:
+def decisions(parameters: Parameters, batch: OptionSteps, config: OptionGailConfig) -> Decisions:
     """Return how probable each level's decisions are."""
-    model, (states, actions, _) = OptionModel.of(parameters, config.least_log_deviation), played.steps
-    log_high = model.log_high(states)[torch.arange(len(states)), played.before]
-    chosen = log_high.gather(1, played.options[:, None])[:, 0]
+    model, (states, actions, _) = OptionModel.of(parameters, config.least_log_deviation), batch.steps
+    log_high = model.log_high(states)[torch.arange(len(states)), batch.before]
+    chosen = log_high.gather(1, batch.options[:, None])[:, 0]
     entropy = -(log_high.exp() * log_high).sum(-1).mean()
-    return Decisions(chosen, model.log_own(states, actions, played.options), entropy)
+    return Decisions(chosen, model.log_chosen(states, actions, batch.options), entropy)
 
 
 def improve(
-    moved: Parameters, played: Played, aims: Aims, config: OptionGailConfig, generator: torch.Generator
+    moved: Parameters, batch: OptionSteps, targets: Targets, config: OptionGailConfig, generator: torch.Generator
 ) -> dict[str, float]:
     """Improve both levels and the critic in place, down L = −L_clip of either level − c·entropy + ½(V_L − return)²."""
     with torch.no_grad():
-        old = decisions(moved, played, config)
+        old = decisions(moved, batch, config)
     descent = torch.optim.AdamW(
         named(moved, (*POLICY, "critic.")), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
     )
-    for index in _minibatches(len(played.options), config.minibatch, config.policy_epochs, generator):
-        some = played.at(index)
+    for index in _minibatches(len(batch.options), config.minibatch, config.policy_epochs, generator):
+        some = batch.at(index)
         new = decisions(moved, some, config)
-        high = clipped_surrogate(new.high - old.high[index], aims.high[index], config.clip)
-        low = clipped_surrogate(new.low - old.low[index], aims.low[index], config.clip)
-        errors = low_values(moved, some) - aims.returns[index]
+        high = clipped_surrogate(new.high - old.high[index], targets.high[index], config.clip)
+        low = clipped_surrogate(new.low - old.low[index], targets.low[index], config.clip)
+        errors = low_values(moved, some) - targets.returns[index]
         descend(descent, errors.square().mean() / 2 - high - low - config.option_entropy * new.entropy)
     with torch.no_grad():
-        new, errors = decisions(moved, played, config), low_values(moved, played) - aims.returns
+        new, errors = decisions(moved, batch, config), low_values(moved, batch) - targets.returns
         return {
             "value_error": errors.square().mean().item(),
             "option_entropy": new.entropy.item(),

@@ -14,14 +14,14 @@ from dmil_core.losses import Steps
 from dmil_core.methods.base import FineTuning, MetaLearner, OnlineMetaLearner, TaskGradient
 from dmil_core.methods.option_gail.adversary import (
     POLICY,
-    Played,
-    aims_of,
+    OptionSteps,
     discriminate,
     discriminator_logits,
     imitation_rewards,
     improve,
     named,
     orthogonal,
+    ppo_targets,
 )
 from dmil_core.methods.option_gail.config import OptionGailConfig, OptionGailOfflineConfig
 from dmil_core.methods.option_gail.option_model import (
@@ -55,7 +55,7 @@ class OptionBatch:
         return tuple(demonstration.id for demonstration in self.demonstrations)
 
 
-class _Imitated(NamedTuple):
+class _EmLoss(NamedTuple):
     loss: Float[Tensor, ""]
     """To differentiate: its value is the negative log-likelihood for hard EM only."""
     metrics: dict[str, float]
@@ -81,7 +81,7 @@ class _Options(MetaLearner[Any, OptionBatch]):
         descent = torch.optim.Adam(adapted.values(), lr=fine_tuning.learning_rate, fused=True)
         steps = Steps.of(support, self.normalise)
         for _ in range(fine_tuning.steps):
-            descend(descent, self._imitate(adapted, steps, "hard").loss)
+            descend(descent, self._em_loss(adapted, steps, "hard").loss)
         return OptionPolicy(self._model(without_graph(adapted)), self.normalise)
 
     def _model(self, parameters: Parameters) -> OptionModel:
@@ -93,7 +93,7 @@ class _Options(MetaLearner[Any, OptionBatch]):
         chosen = rng.choice(len(demonstrations), count, replace=False)
         return OptionBatch(tuple(demonstrations[index] for index in chosen), phase, int(rng.integers(2**63)))
 
-    def _imitate(self, parameters: Parameters, steps: Steps, phase: Phase) -> _Imitated:
+    def _em_loss(self, parameters: Parameters, steps: Steps, phase: Phase) -> _EmLoss:
         """Return what EM goes down, per step: the E-step's weights are held fixed."""
         model, count = self._model(parameters), len(steps.states)
         log_high, log_low = model.log_high(steps.states), model.log_low(steps.states, steps.actions)
@@ -111,7 +111,7 @@ class _Options(MetaLearner[Any, OptionBatch]):
             "deviation": model.log_deviations.detach().exp().mean().item(),
             **{f"sub_skill_share/{k}": share for k, share in enumerate(pairs.mean(0).sum(0).tolist())},
         }
-        return _Imitated(loss, metrics, pairs)
+        return _EmLoss(loss, metrics, pairs)
 
 
 class OptionGailOffline(_Options):
@@ -127,9 +127,9 @@ class OptionGailOffline(_Options):
     def task_gradient(self, parameters: Parameters, batch: OptionBatch) -> TaskGradient:
         """Return the gradient of −log p per step: of the actions, or of the actions and Viterbi's labels."""
         free = leaves(parameters)
-        imitated = self._imitate(free, Steps.of(batch.demonstrations, self.normalise), batch.phase)
-        gradients = torch.autograd.grad(imitated.loss, list(free.values()))
-        return TaskGradient(flatten(dict(zip(free, gradients, strict=True))), imitated.metrics)
+        em = self._em_loss(free, Steps.of(batch.demonstrations, self.normalise), batch.phase)
+        gradients = torch.autograd.grad(em.loss, list(free.values()))
+        return TaskGradient(flatten(dict(zip(free, gradients, strict=True))), em.metrics)
 
 
 class OptionGail(_Options, OnlineMetaLearner[Any, OptionBatch]):
@@ -139,11 +139,11 @@ class OptionGail(_Options, OnlineMetaLearner[Any, OptionBatch]):
 
     def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the option model, the critic V_L(s, o) and the discriminator."""
-        k, critic, judge = self.config.sub_skills, self.config.critic_units, self.config.discriminator_units
+        k, critic, units = self.config.sub_skills, self.config.critic_units, self.config.discriminator_units
         return {
             **super().initial_parameters(rng),
             **orthogonal("critic", [self.obs_dim, critic, critic, k], rng),
-            **orthogonal("discriminator", [self.obs_dim + self.action_dim, judge, judge, (k + 1) * k], rng),
+            **orthogonal("discriminator", [self.obs_dim + self.action_dim, units, units, (k + 1) * k], rng),
         }
 
     def environment_steps(self, iteration: int) -> int:
@@ -171,40 +171,40 @@ class OptionGail(_Options, OnlineMetaLearner[Any, OptionBatch]):
         moved = leaves(parameters, copy=True)
         demonstrated = Steps.of(batch.demonstrations, self.normalise)
         if batch.phase == "adversarial":
-            metrics = self._play_round(moved, demonstrated, batch)
+            metrics = self._adversarial_round(moved, demonstrated, batch)
         else:
-            metrics = self._imitate_for_some_steps(moved, demonstrated, batch.phase)
+            metrics = self._offline_steps(moved, demonstrated, batch.phase)
         with torch.no_grad():
             return TaskGradient(flatten({name: parameters[name] - moved[name] for name in moved}), metrics)
 
-    def _imitate_for_some_steps(self, moved: dict[str, Tensor], demonstrated: Steps, phase: Phase) -> dict[str, float]:
+    def _offline_steps(self, moved: dict[str, Tensor], demonstrated: Steps, phase: Phase) -> dict[str, float]:
         """Descend in place, and return the metrics before."""
         descent = torch.optim.Adam(named(moved, POLICY), lr=self.config.offline_learning_rate, fused=True)
         metrics = []
         for _ in range(self.config.offline_steps):
-            imitated = self._imitate(moved, demonstrated, phase)
-            metrics.append(imitated.metrics)
-            descend(descent, imitated.loss)
+            em = self._em_loss(moved, demonstrated, phase)
+            metrics.append(em.metrics)
+            descend(descent, em.loss)
         return metrics[0]
 
-    def _play_round(self, moved: dict[str, Tensor], demonstrated: Steps, batch: OptionBatch) -> dict[str, float]:
+    def _adversarial_round(self, moved: dict[str, Tensor], demonstrated: Steps, batch: OptionBatch) -> dict[str, float]:
         """Relabel, discriminate and improve in place, and return the metrics."""
         generator, rollouts = torch.Generator().manual_seed(batch.seed), batch.rollouts
         with torch.no_grad():
-            labelled = self._imitate(moved, demonstrated, "hard")
+            labelled = self._em_loss(moved, demonstrated, "hard")
         start = self.config.sub_skills
-        expert = Played.of(demonstrated, labelled.pairs.sum(1).argmax(-1), start)
-        played = Played.of_rollouts(rollouts, self.normalise, start)
-        judged = discriminate(moved, played, expert, self.config, generator)
+        expert = OptionSteps.of(demonstrated, labelled.pairs.sum(1).argmax(-1), start)
+        rollout_steps = OptionSteps.of_rollouts(rollouts, self.normalise, start)
+        discriminator_metrics = discriminate(moved, rollout_steps, expert, self.config, generator)
         with torch.no_grad():
-            rewards = imitation_rewards(discriminator_logits(moved, played, start))
+            rewards = imitation_rewards(discriminator_logits(moved, rollout_steps, start))
         last = np.stack([rollout.observations[-1] for rollout in rollouts])
-        aims = aims_of(moved, played, rewards, torch.from_numpy(self.normalise(last)), self.config)
+        targets = ppo_targets(moved, rollout_steps, rewards, torch.from_numpy(self.normalise(last)), self.config)
         return {
             **labelled.metrics,
-            **judged,
+            **discriminator_metrics,
             "reward": rewards.mean().item(),
-            **improve(moved, played, aims, self.config, generator),
-            "environment_steps": float(len(played.options)),
+            **improve(moved, rollout_steps, targets, self.config, generator),
+            "environment_steps": float(len(rollout_steps.options)),
             "practice_success": float(np.mean([rollout.success for rollout in rollouts])),
         }

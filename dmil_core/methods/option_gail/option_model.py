@@ -57,7 +57,7 @@ class OptionModel(NamedTuple):
         means = torch.stack([mlp(sub_skill, states) for sub_skill in self.low], 1)
         return _log_density(actions[:, None] - means, self.log_deviations)
 
-    def log_own(
+    def log_chosen(
         self,
         states: Float[Tensor, "steps obs_dim"],
         actions: Float[Tensor, "steps action_dim"],

@@ -148,7 +148,7 @@ def test_densities_are_those_of_normal_distributions(parameters, plain_mlp) -> N
         distribution = Normal(plain_mlp(sub_skill, states), model.log_deviations[k].exp())
         torch.testing.assert_close(found[:, k], distribution.log_prob(actions).sum(-1))
     options = torch.tensor([2, 0, 2, 2, 0, 0, 2])  # one is chosen nowhere
-    torch.testing.assert_close(model.log_own(states, actions, options), found[torch.arange(7), options])
+    torch.testing.assert_close(model.log_chosen(states, actions, options), found[torch.arange(7), options])
 
 
 def test_the_high_level_has_a_row_for_each_last_option_and_the_start(parameters, plain_mlp) -> None:
