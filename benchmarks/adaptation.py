@@ -52,21 +52,21 @@ class Contest(NamedTuple):
     target: float
 
 
-def run(given: Arguments) -> Sequence[Row]:
+def run(args: Arguments) -> Sequence[Row]:
     """Run the benchmark."""
     torch.set_num_threads(1)
-    rows = [_measure(contest, given.rounds) for contest in (*_dmil(given), _mil(given))]
+    rows = [_measure(contest, args.rounds) for contest in (*_dmil(args), _mil(args))]
     console.print(lay_out("adaptation and acting on one core", [_cells(row) for row in rows]))
     return rows
 
 
-def _mil(given: Arguments) -> Contest:
+def _mil(args: Arguments) -> Contest:
     config = MilConfig()
     method = Mil(config, ACTION_DIM, Normalisation.identity(OBS_DIM))
     parameters = method.initial_parameters(named_rng(0, "benchmark parameters"))
     support = [
         Demonstration(str(number), "drawn", steps.states.numpy(), steps.actions.numpy())
-        for number, steps in enumerate(draw_steps(seed, 1, 100) for seed in range(given.shots))
+        for number, steps in enumerate(draw_steps(seed, 1, 100) for seed in range(args.shots))
     ]
     policy = method.adapt(parameters, support, FineTuning(config.inner_steps, config.inner_learning_rate))
     used = [
@@ -80,10 +80,10 @@ def _mil(given: Arguments) -> Contest:
     return Contest("MIL: act in 1 state", rivals, CALLS, 3e-3)
 
 
-def _dmil(given: Arguments) -> list[Contest]:
-    config = settings("paper", given.sub_skills, "second")
-    parameters, support = draw_parameters(config), draw_steps(0, given.shots, 100)
-    steps, rate = given.fine_tuning_steps, 1e-3
+def _dmil(args: Arguments) -> list[Contest]:
+    config = settings("paper", args.sub_skills, "second")
+    parameters, support = draw_parameters(config), draw_steps(0, args.shots, 100)
+    steps, rate = args.fine_tuning_steps, 1e-3
     config = config.model_copy(update={"inner_learning_rate": rate})
     twin, hierarchy = MaskedTwin(config), Hierarchy.of(as_in_a_run(parameters))
 
@@ -107,7 +107,7 @@ def _dmil(given: Arguments) -> list[Contest]:
         }
         return Contest(f"act in {states} state{'s' * (states > 1)}", rivals, CALLS, target)
 
-    adapting = Contest(f"adapt, {given.shots} shot, {steps} steps", {"ours": ours, "twin": theirs}, 1, 1.5)
+    adapting = Contest(f"adapt, {args.shots} shot, {steps} steps", {"ours": ours, "twin": theirs}, 1, 1.5)
     return [adapting, acting(1, 150e-6), acting(20, 500e-6)]
 
 

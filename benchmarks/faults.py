@@ -206,22 +206,22 @@ def _counts(outcomes: Sequence[Outcome], wanted: str | None, kind: str = "all") 
     return found
 
 
-def run(given: Arguments) -> Row:
+def run(args: Arguments) -> Row:
     """Run the benchmark."""
-    folder = given.folder or Path(tempfile.mkdtemp(prefix="dmil-faults-"))
+    folder = args.folder or Path(tempfile.mkdtemp(prefix="dmil-faults-"))
     folder.mkdir(parents=True, exist_ok=True)
-    campaign = Campaign(folder.resolve(), random.Random(given.seed))
+    campaign = Campaign(folder.resolve(), random.Random(args.seed))
     try:
         campaign.collect()
         undisturbed = campaign.run("undisturbed", 0)
         outcomes: list[Outcome] = []
-        with Bar("kills", given.kills) as bar:
-            while (done := sum(outcome.kills.total() for outcome in outcomes)) < given.kills:
-                outcome = campaign.run(f"run-{len(outcomes):03d}", min(KILLS_PER_RUN, given.kills - done))
+        with Bar("kills", args.kills) as bar:
+            while (done := sum(outcome.kills.total() for outcome in outcomes)) < args.kills:
+                outcome = campaign.run(f"run-{len(outcomes):03d}", min(KILLS_PER_RUN, args.kills - done))
                 outcomes.append(outcome)
                 bar.advance(outcome.kills.total(), f"{len(outcomes)} runs, {_counts(outcomes, undisturbed.found)}")
     finally:
-        if given.folder is None:
+        if args.folder is None:
             shutil.rmtree(folder, ignore_errors=True)
     counts = _counts(outcomes, undisturbed.found)
     costs = _costs(outcomes, undisturbed.seconds)

@@ -32,11 +32,11 @@ def main(run: Callable[[A], Sequence[Row] | Row], defaults: A, description: str 
     """Run a benchmark as a program: read its arguments, and write what it returns as JSON if that is asked for."""
 
     def program(arguments: Sequence[str]) -> None:
-        given = parse(type(defaults), description or "", arguments, defaults)
-        rows = run(given)
-        if given.json is not None:
-            write_rows(given.json, rows)
-            console.print(f"rows: {given.json}")
+        args = parse(type(defaults), description or "", arguments, defaults)
+        rows = run(args)
+        if args.json is not None:
+            write_rows(args.json, rows)
+            console.print(f"rows: {args.json}")
 
     sys.exit(exit_code(program, sys.argv[1:]))
 

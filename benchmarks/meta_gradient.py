@@ -221,14 +221,14 @@ def _verdict(value: float, wanted: float | None, unit: str) -> str:
     return f" ({'meets' if value >= wanted else 'misses'} {wanted}{unit})"
 
 
-def run(given: Arguments) -> Sequence[Row]:
+def run(args: Arguments) -> Sequence[Row]:
     """Run the benchmark."""
     torch.set_num_threads(WORKERS)
-    plan = list(itertools.product(given.sizes, given.orders, given.sub_skills))
+    plan = list(itertools.product(args.sizes, args.orders, args.sub_skills))
     rows = []
     with Bar("measuring", len(plan)) as bar:
         for size, order, k in plan:
-            rows.append(measure(size, order, k, given.rounds))
+            rows.append(measure(size, order, k, args.rounds))
             bar.advance(1, f"{size}, {order} order, K = {k}")
     title = f"one task's meta-gradient: ours on {WORKERS} workers, the twin on {WORKERS} threads"
     console.print(lay_out(title, [_cells(row) for row in rows], words=2))

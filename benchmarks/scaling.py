@@ -143,14 +143,14 @@ def cells(row: Row) -> dict[str, str]:
     }
 
 
-def run(given: Arguments) -> Sequence[harness.Row]:
+def run(args: Arguments) -> Sequence[harness.Row]:
     """Run the benchmark."""
     rows: list[Row] = []
     runner = RayRunner(MetaWorldSuite(PRESETS["ml10-quick"].suite), sum(WORKERS))
     try:
-        for size in given.sizes:
+        for size in args.sizes:
             plan, turns = made_up_plan(f"ml10-{size}", SLOTS_PER_GROUP), TURNS[size]
-            turns = turns._replace(rounds=given.rounds or turns.rounds)
+            turns = turns._replace(rounds=args.rounds or turns.rounds)
             console.print(f"{size}: {turns.rounds} rounds of {turns.iterations} iterations")
             trainings: dict[str, MetaTraining] = {"local": LocalMetaTraining(plan)}
             trainings |= {f"ray {workers}": RayMetaTraining(plan, workers) for workers in WORKERS}

@@ -76,14 +76,14 @@ class Arguments(BenchmarkArguments):
     """Two tasks, one round, a small evaluation: to see that it runs."""
 
 
-def run(given: Arguments) -> Sequence[Row]:
+def run(args: Arguments) -> Sequence[Row]:
     """Run the benchmark."""
-    if given.quick:
-        given = Arguments(
-            tasks=given.tasks[:2],
+    if args.quick:
+        args = Arguments(
+            tasks=args.tasks[:2],
             episodes=1,
             rounds=1,
-            evaluation_tasks=given.evaluation_tasks[:2],
+            evaluation_tasks=args.evaluation_tasks[:2],
             evaluation_episodes=2,
             evaluation_rounds=1,
             horizon=50,
@@ -91,16 +91,16 @@ def run(given: Arguments) -> Sequence[Row]:
         )
     torch.set_num_threads(1)
     rows: list[dict[str, Any]] = []
-    suite = MetaWorldSuite(SuiteConfig(train_tasks=given.tasks, test_tasks=given.evaluation_tasks))
-    for task in given.tasks:
-        rows.append(step_row(suite, task, given.episodes, given.rounds))
+    suite = MetaWorldSuite(SuiteConfig(train_tasks=args.tasks, test_tasks=args.evaluation_tasks))
+    for task in args.tasks:
+        rows.append(step_row(suite, task, args.episodes, args.rounds))
         console.print(f"{task}: {rows[-1]['ratio']:.2f} times stock")
     rows.append(median_row(rows))
     console.print(lay_out("Steps per second and core, driven by the experts", [step_cells(row) for row in rows]))
     verdict("steps/s over stock, median over tasks", rows[-1]["ratio"], STEPS_TARGET)
     verdict("steps/s over bare physics, median over tasks", rows[-1]["physics_share"], PHYSICS_TARGET)
-    if given.evaluation_rounds:
-        rows.append(evaluation_row(given))
+    if args.evaluation_rounds:
+        rows.append(evaluation_row(args))
         print_evaluation(rows[-1])
         verdict("whole evaluations over Meta-World's", rows[-1]["ratio"], EVALUATION_TARGET)
     return rows
@@ -285,12 +285,12 @@ def run_item(item: AdaptationRollouts) -> AdaptationOutcome:
     return worker.run(item)
 
 
-def evaluation_row(given: Arguments) -> dict[str, Any]:
+def evaluation_row(args: Arguments) -> dict[str, Any]:
     """Time whole evaluations of one policy, Meta-World's and ours, in alternation."""
     cores = len(os.sched_getaffinity(0))
-    tasks, episodes = given.evaluation_tasks, given.evaluation_episodes
-    suite = MetaWorldSuite(SuiteConfig(test_tasks=tasks, horizon=given.horizon))
-    method, parameters, demonstrations = one_policy(suite, tasks, given.fine_tuning_steps)
+    tasks, episodes = args.evaluation_tasks, args.evaluation_episodes
+    suite = MetaWorldSuite(SuiteConfig(test_tasks=tasks, horizon=args.horizon))
+    method, parameters, demonstrations = one_policy(suite, tasks, args.fine_tuning_steps)
     policy = method.adapt(parameters, demonstrations[tasks[0]], FineTuning(0, 0.0))
     settings = EvaluationConfig(shots=(1,), episodes=episodes, support_draws=DRAWS, fine_tuning_steps=0)
     plan = plan_adaptations([("meta-testing", task) for task in tasks], settings)
@@ -307,7 +307,7 @@ def evaluation_row(given: Arguments) -> dict[str, Any]:
         "Meta-World/custom-mt-envs",
         vector_strategy="async",
         envs_list=[f"{task}-v3" for task in tasks],
-        max_episode_steps=given.horizon,
+        max_episode_steps=args.horizon,
         seed=1,
     )
 
@@ -324,7 +324,7 @@ def evaluation_row(given: Arguments) -> dict[str, Any]:
         both = {"stock": stock, "ours": ours}
         alternate(both, 1)  # builds the environments
         agents.clear()
-        times = alternate(both, given.evaluation_rounds)
+        times = alternate(both, args.evaluation_rounds)
     envs.close()
     act = alternate({"act": partial(StockAgent(policy).eval_action, np.zeros((episodes // DRAWS, 39)))}, 101)
     seconds = {name: median(values) for name, values in times.items()}
@@ -334,9 +334,9 @@ def evaluation_row(given: Arguments) -> dict[str, Any]:
         "task": "evaluation",
         "tasks": len(tasks),
         "episodes": episodes,
-        "horizon": given.horizon,
+        "horizon": args.horizon,
         "cores": cores,
-        "rounds": given.evaluation_rounds,
+        "rounds": args.evaluation_rounds,
         "stock_seconds": seconds["stock"],
         "ours_seconds": seconds["ours"],
         "ratio": seconds["stock"] / seconds["ours"],

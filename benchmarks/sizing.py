@@ -226,31 +226,31 @@ def in_words(costs: Costs) -> str:
     )
 
 
-def run(given: Arguments) -> Sequence[harness.Row]:
+def run(args: Arguments) -> Sequence[harness.Row]:
     """Run the benchmark."""
     network, rows = Network(), list[Row]()
     console.print(
         f"assumed: {network.workers_per_node} workers a node, {network.bytes_per_second * 8e-9:.0f} Gbit/s and "
-        f"{network.latency * 1e3:.1f} ms between nodes, ${given.price} a CPU's hour"
+        f"{network.latency * 1e3:.1f} ms between nodes, ${args.price} a CPU's hour"
     )
-    runner = RayRunner(MetaWorldSuite(PRESETS[given.presets[0]].suite), 1)
+    runner = RayRunner(MetaWorldSuite(PRESETS[args.presets[0]].suite), 1)
     try:
-        for preset in given.presets:
+        for preset in args.presets:
             training = PRESETS[preset].training
-            costs = measured_costs(made_up_plan(preset), given.rounds)
+            costs = measured_costs(made_up_plan(preset), args.rounds)
             console.print(f"\n{preset}, {training.iterations} iterations; measured: {in_words(costs)}")
-            if given.faster != 1:
-                console.print(f"assumed: a slot takes {given.faster:g} times less")
-            costs = costs._replace(slot=costs.slot / given.faster)
-            fixed = [row(given, preset, costs, workers, training.tasks_per_iteration) for workers in given.workers]
-            each = [row(given, preset, costs, workers, workers * training.slots_per_group) for workers in given.workers]
+            if args.faster != 1:
+                console.print(f"assumed: a slot takes {args.faster:g} times less")
+            costs = costs._replace(slot=costs.slot / args.faster)
+            fixed = [row(args, preset, costs, workers, training.tasks_per_iteration) for workers in args.workers]
+            each = [row(args, preset, costs, workers, workers * training.slots_per_group) for workers in args.workers]
             console.print(lay_out("The preset as it is", [*map(cells_as_it_is, fixed)], words=0, box=SIMPLE))
             title = "Another experiment: a group of slots for each worker"
             console.print(lay_out(title, [*map(cells_grown, each)], words=0, box=SIMPLE))
             rows += fixed + each
     finally:
         runner.close()
-    assumed = {"fan_in": FAN_IN, "price": given.price, "faster": given.faster}
+    assumed = {"fan_in": FAN_IN, "price": args.price, "faster": args.faster}
     return [row._asdict() | assumed for row in rows]
 
 

@@ -171,14 +171,14 @@ def cells(row: Row) -> dict[str, str]:
     }
 
 
-def run(given: Arguments) -> Sequence[harness.Row]:
+def run(args: Arguments) -> Sequence[harness.Row]:
     """Run the benchmark."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)))
-        rows = measure(folder, stack.enter_context(slow_server()), given.rounds, given.iterations)
+        rows = measure(folder, stack.enter_context(slow_server()), args.rounds, args.iterations)
     console.print(lay_out("Meta-training of the quick size beside MLflow", [cells(row) for row in rows], box=SIMPLE))
     here = machine()
-    console.print(f"{here['cpus']} CPUs, load average {here['load_average']:.1f}, {given.rounds} rounds")
+    console.print(f"{here['cpus']} CPUs, load average {here['load_average']:.1f}, {args.rounds} rounds")
     missed = [row for row in rows if row.records and row.ratio < LEAST]
     lines = [f"missed: {row.mlflow}: {row.ratio:.3f} of the speed without tracking, wanted {LEAST}" for row in missed]
     console.print("\n".join(lines) or "all targets are met")

@@ -117,11 +117,11 @@ class EvaluationConfig(Settings):
     """Iterations between evaluations, a multiple of checkpoint_every; none evaluates at the end alone."""
 
 
-def _method_settings(given: object) -> object:
+def _method_settings(settings: object) -> object:
     """Return settings of a method as those of the method that they name."""
-    if not isinstance(given, Mapping):
-        return given
-    return config_type(given.get("name", DEFAULT_METHOD)).model_validate(given)
+    if not isinstance(settings, Mapping):
+        return settings
+    return config_type(settings.get("name", DEFAULT_METHOD)).model_validate(settings)
 
 
 class ExperimentConfig(Settings):

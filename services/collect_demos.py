@@ -54,12 +54,12 @@ def run(arguments: Sequence[str]) -> None:
     if arguments and arguments[0] in OTHERS:
         OTHERS[arguments[0]](arguments[1:])
         return
-    given = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(peek(arguments, **EARLY))))
+    args = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(peek(arguments, **EARLY))))
     store = open_store()
     announce(demonstrations=(store.root, f"{DATA}=FOLDER"))
-    experiment = Experiment(given.experiment, store)
+    experiment = Experiment(args.experiment, store)
     clock = Clock()
-    with open_runner(given.runner, experiment.suite, given.workers) as runner:
+    with open_runner(args.runner, experiment.suite, args.workers) as runner:
         clock.lap("start")
         data = experiment.collect(runner)
         clock.lap("collect")

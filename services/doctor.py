@@ -59,14 +59,14 @@ def run(arguments: Sequence[str]) -> None:
     Raises:
         RunError: if something is bad.
     """
-    given = parse(Arguments, __doc__ or "", arguments, Arguments())
+    args = parse(Arguments, __doc__ or "", arguments, Arguments())
     mark = f".doctor-{uuid4().hex}"
-    findings = [*_storage("runs", given.runs, mark), *_storage("demonstrations", data_root(), mark)]
+    findings = [*_storage("runs", args.runs, mark), *_storage("demonstrations", data_root(), mark)]
     if named_address() is not None:
-        with joined(), _marked(given.runs / mark):
-            nodes, silent = cluster_facts(given.runs, mark)
+        with joined(), _marked(args.runs / mark):
+            nodes, silent = cluster_facts(args.runs, mark)
     else:
-        nodes, silent = [facts(str(given.runs), mark)], []
+        nodes, silent = [facts(str(args.runs), mark)], []
     findings += [Finding(f"node {name}", "bad", "does not answer", "look at it, or take it away") for name in silent]
     findings += [*examine(nodes), _mlflow()]
     console.print(_table(findings))

@@ -52,31 +52,31 @@ def run(arguments: Sequence[str]) -> None:
     path: Path | None = peek(arguments, checkpoint=Path).checkpoint
     checkpoint = None if path is None else _opened(path)
     evaluation = EvaluationConfig() if checkpoint is None else checkpoint.manifest.config.evaluation
-    given = parse(Arguments, __doc__ or "", arguments, Arguments(path or tyro.MISSING, evaluation))
+    args = parse(Arguments, __doc__ or "", arguments, Arguments(path or tyro.MISSING, evaluation))
     assert checkpoint is not None, "without --checkpoint there is nothing that parses"
-    config = with_evaluation(checkpoint.manifest.config, given.evaluation)
-    if given.tasks is not None:
-        if given.promote:
+    config = with_evaluation(checkpoint.manifest.config, args.evaluation)
+    if args.tasks is not None:
+        if args.promote:
             raise UserError("--promote: got --tasks with it; wanted all of the suite's, by which models are compared")
-        config = config.model_copy(update={"suite": config.suite.model_copy(update={"test_tasks": given.tasks})})
+        config = config.model_copy(update={"suite": config.suite.model_copy(update={"test_tasks": args.tasks})})
     experiment = Experiment(config, store := open_store())
-    announce(evaluation=(given.output, "--output FOLDER"), demonstrations=(store.root, f"{DATA}=FOLDER"))
-    given.output.mkdir(parents=True, exist_ok=True)
-    promotion = open_promotion(checkpoint, experiment, given.output / ALIAS) if given.promote else None
+    announce(evaluation=(args.output, "--output FOLDER"), demonstrations=(store.root, f"{DATA}=FOLDER"))
+    args.output.mkdir(parents=True, exist_ok=True)
+    promotion = open_promotion(checkpoint, experiment, args.output / ALIAS) if args.promote else None
     clock = Clock()
-    with open_runner(given.runner, experiment.suite, given.workers) as runner:
+    with open_runner(args.runner, experiment.suite, args.workers) as runner:
         clock.lap("start")
         data = experiment.collect(runner)
         clock.lap("collect")
-        evaluation = experiment.evaluate(runner, data, checkpoint, given.output, given.tasks)
+        evaluation = experiment.evaluate(runner, data, checkpoint, args.output, args.tasks)
         if promotion is not None:
             promotion.evaluate_champion(runner, data)
         clock.lap("evaluate")
-    summary = summarise(evaluation, seconds=clock.seconds, folder=given.output)
-    write_report(summary, given.output)
+    summary = summarise(evaluation, seconds=clock.seconds, folder=args.output)
+    write_report(summary, args.output)
     show(summary)
     if promotion is not None:
-        for line in promotion.decide(evaluation, given.output):
+        for line in promotion.decide(evaluation, args.output):
             console.print(line, markup=False, soft_wrap=True)
 
 

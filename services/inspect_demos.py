@@ -33,10 +33,10 @@ class Arguments:
 
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
-    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
-    suite = None if given.suite is None else open_suite(suite_settings(given.suite))
-    form = given.data.partition(":")[0]
-    place = given.data if form in FORMS else f"{SUFFIXES.get(Path(given.data).suffix, 'minari')}:{given.data}"
+    args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
+    suite = None if args.suite is None else open_suite(suite_settings(args.suite))
+    form = args.data.partition(":")[0]
+    place = args.data if form in FORMS else f"{SUFFIXES.get(Path(args.data).suffix, 'minari')}:{args.data}"
     episodes = read_episodes(place)
     console.print(_table(place, episodes, suite))
     problems = [*_problems(episodes, suite)]

@@ -81,13 +81,13 @@ class Arguments:
 
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
-    given, folder, checkpoint = _read(arguments)
+    args, folder, checkpoint = _read(arguments)
     with replicated(folder):
-        _carry_out(given, folder, checkpoint)
+        _carry_out(args, folder, checkpoint)
 
 
-def _carry_out(given: Arguments, folder: Path, checkpoint: Checkpoint | None) -> None:
-    config = given.experiment
+def _carry_out(args: Arguments, folder: Path, checkpoint: Checkpoint | None) -> None:
+    config = args.experiment
     experiment = Experiment(config, store := open_store())
     announce(
         run=(folder, "--runs FOLDER"),
@@ -102,7 +102,7 @@ def _carry_out(given: Arguments, folder: Path, checkpoint: Checkpoint | None) ->
     status = "FAILED"
     try:
         record_settings(tracker, config)
-        with recording_system(tracker), open_runner(given.runner, experiment.suite, given.workers) as runner:
+        with recording_system(tracker), open_runner(args.runner, experiment.suite, args.workers) as runner:
             clock.lap("start")
             data = experiment.collect(runner)
             tracker.inputs({dataset.id: dataset.digest for dataset in data.values()})
@@ -113,8 +113,8 @@ def _carry_out(given: Arguments, folder: Path, checkpoint: Checkpoint | None) ->
                 checkpoints,
                 tracker,
                 checkpoint,
-                overlap_evaluation=given.overlap_evaluation,
-                on_nonfinite=given.on_nonfinite,
+                overlap_evaluation=args.overlap_evaluation,
+                on_nonfinite=args.on_nonfinite,
             )
             clock.lap("train")
             evaluation = experiment.evaluate(runner, data, trained, folder)
@@ -140,12 +140,12 @@ def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]
     """Return the arguments, the run's folder, and the checkpoint to go on from."""
     early = peek(arguments, **EARLY, resume=str, runs=Path)
     if early.resume is None:
-        given = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(early)))
-        config = given.experiment
+        args = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(early)))
+        config = args.experiment
         named = "" if config.method.name == DEFAULT_METHOD else f"{config.method.name}-"
-        kind = f"{config.suite.name}-{named}{given.preset.rpartition('-')[2]}"
-        folder = new_folder(given.name or f"{kind}-{datetime.now():%Y%m%d-%H%M%S}", given.runs, MARK)
-        return given, folder, None
+        kind = f"{config.suite.name}-{named}{args.preset.rpartition('-')[2]}"
+        folder = new_folder(args.name or f"{kind}-{datetime.now():%Y%m%d-%H%M%S}", args.runs, MARK)
+        return args, folder, None
     if any(getattr(early, name) for name in EARLY):
         raise UserError(
             "--resume: got --preset, --config, --suite, --method or --demos with it; wanted none: a run goes on with "
@@ -161,10 +161,10 @@ def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]
     except (OSError, ValidationError) as error:
         got = describe_errors(error) if isinstance(error, ValidationError) else error
         raise UserError(f"{folder / 'config.json'}: {got}; start a new run") from error
-    given = parse(Arguments, __doc__ or "", arguments, Arguments(before))
-    _same_run(before, given.experiment)
-    saved = Checkpoints(folder / "checkpoints", given.experiment.training.checkpoints_kept)
-    return given, folder, saved.newest() if saved.all() else None
+    args = parse(Arguments, __doc__ or "", arguments, Arguments(before))
+    _same_run(before, args.experiment)
+    saved = Checkpoints(folder / "checkpoints", args.experiment.training.checkpoints_kept)
+    return args, folder, saved.newest() if saved.all() else None
 
 
 def _same_run(before: ExperimentConfig, now: ExperimentConfig) -> None:

@@ -37,25 +37,25 @@ class Arguments:
 
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
-    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, tyro.MISSING, tyro.MISSING))
-    if given.source.partition(":")[0] not in FORMS:
-        raise UserError(f"--from: got {given.source}; wanted npz:PATH, hdf5:PATH or minari:ID")
-    suite, store = open_suite(suite_settings(given.suite, (given.task,))), open_store()
+    args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, tyro.MISSING, tyro.MISSING))
+    if args.source.partition(":")[0] not in FORMS:
+        raise UserError(f"--from: got {args.source}; wanted npz:PATH, hdf5:PATH or minari:ID")
+    suite, store = open_suite(suite_settings(args.suite, (args.task,))), open_store()
     announce(demonstrations=(store.root, f"{DATA}=FOLDER"))
-    recorded = demonstrations(given.task, given.source, suite, MOST)
-    dataset_id = f"{suite.family}/{given.task}/recorded-{recorded.digest[:10]}-v2"
+    recorded = demonstrations(args.task, args.source, suite, MOST)
+    dataset_id = f"{suite.family}/{args.task}/recorded-{recorded.digest[:10]}-v2"
     saved = store.save(
         dataset_id,
-        given.task,
+        args.task,
         [_episode(demonstration) for demonstration in recorded.demonstrations],
         failed=0,
-        settings={"protocol": suite.protocol, "source": given.source},
+        settings={"protocol": suite.protocol, "source": args.source},
         algorithm="recorded",
     )
     steps = sum(len(demonstration) for demonstration in saved.demonstrations)
     console.print(
         f"{store.root / dataset_id}: {len(saved.demonstrations)} demonstrations of {steps} steps\n"
-        f"to use them: --suite {given.suite} --demos minari:{given.task}={dataset_id}"
+        f"to use them: --suite {args.suite} --demos minari:{args.task}={dataset_id}"
     )
 
 

@@ -32,8 +32,8 @@ class Arguments:
 
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
-    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
-    failure = read_failure(given.failure)
+    args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
+    failure = read_failure(args.failure)
     console.print(f"{failure.where}: it failed with\n{failure.problem}\nand is done again:")
     experiment = Experiment(failure.config, open_store())
     work = _attempt if "attempt" in failure.piece else _slot if "slot" in failure.piece else _adaptation

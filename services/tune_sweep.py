@@ -73,8 +73,8 @@ class Arguments:
 
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
-    given = parse(Arguments, _description(), arguments, Arguments())
-    sweep = _resumed(given) if given.resume is not None else _begun(given)
+    args = parse(Arguments, _description(), arguments, Arguments())
+    sweep = _resumed(args) if args.resume is not None else _begun(args)
     clock = Clock()
     tracker = Tracker(sweep.path, f"dmil-{sweep.record.name}")
     status = "FAILED"
@@ -127,27 +127,27 @@ def _read(file: Path) -> Sweep:
         raise UserError("\n".join(f"{file}: {line}" for line in describe_errors(error).splitlines())) from error
 
 
-def _begun(given: Arguments) -> SweepFolder:
+def _begun(args: Arguments) -> SweepFolder:
     """Make the folder of a new sweep."""
     known = [file.stem for file in sorted(CONFIGS.glob("*.yaml"))]
-    if given.sweep is None:
+    if args.sweep is None:
         raise UserError(f"SWEEP: got none; wanted a file as tune_configs/em.yaml, or one of {', '.join(known)}")
-    file = CONFIGS / f"{given.sweep}.yaml" if given.sweep in known else Path(given.sweep)
+    file = CONFIGS / f"{args.sweep}.yaml" if args.sweep in known else Path(args.sweep)
     try:
-        sweep = _read(file).at(given.preset, given.suites or (), given.seeds or ())
+        sweep = _read(file).at(args.preset, args.suites or (), args.seeds or ())
     except ValidationError as error:
         raise UserError("\n".join(f"--{line}" for line in describe_errors(error).splitlines())) from error
     for value, flag in ((sweep.suites, "--suites"), (sweep.seeds, "--seeds")):
         if len(set(value)) < len(value):
             raise UserError(f"{flag}: got {' '.join(map(str, value))}; wanted each once")
-    for trial in planned(sweep, given.preset):
+    for trial in planned(sweep, args.preset):
         open_suite(trial.config.suite)
-    name = given.name or f"{file.stem}-{given.preset}-{datetime.now():%Y%m%d-%H%M%S}"
-    folder = new_folder(name, given.runs, MARK)
+    name = args.name or f"{file.stem}-{args.preset}-{datetime.now():%Y%m%d-%H%M%S}"
+    folder = new_folder(name, args.runs, MARK)
     _announce(folder)
     record = SweepRecord(
         name=file.stem,
-        preset=given.preset,
+        preset=args.preset,
         sweep=sweep,
         began=datetime.now(UTC),
         command=shlex.join(["python", "-m", "services.tune_sweep", *sys.argv[1:]]),
@@ -157,14 +157,14 @@ def _begun(given: Arguments) -> SweepFolder:
     return SweepFolder.make(folder, record)
 
 
-def _resumed(given: Arguments) -> SweepFolder:
+def _resumed(args: Arguments) -> SweepFolder:
     """Open the folder of a sweep that was begun."""
-    if given.sweep or given.suites or given.seeds or given.name:
+    if args.sweep or args.suites or args.seeds or args.name:
         raise UserError(
             "--resume: got SWEEP, --suites, --seeds or --name with it; wanted none: a sweep goes on with its own"
         )
-    assert given.resume is not None
-    folder = find_folder(given.resume, given.runs, MARK)
+    assert args.resume is not None
+    folder = find_folder(args.resume, args.runs, MARK)
     _announce(folder)
     return SweepFolder(folder)
 

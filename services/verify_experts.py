@@ -45,34 +45,34 @@ class Arguments:
 
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
-    given = parse(Arguments, __doc__ or "", arguments, Arguments())
-    suite = open_suite(suite_settings(given.suite, given.tasks))
-    tasks = given.tasks or getattr(suite, "expert_tasks", (*suite.train_tasks, *suite.test_tasks))
+    args = parse(Arguments, __doc__ or "", arguments, Arguments())
+    suite = open_suite(suite_settings(args.suite, args.tasks))
+    tasks = args.tasks or getattr(suite, "expert_tasks", (*suite.train_tasks, *suite.test_tasks))
     tasks = [task for task in dict.fromkeys(tasks) if suite.expert(task) is not None]
     if not tasks:
         raise UserError(f"--tasks: got none that has a scripted expert in {suite.name}; wanted at least one")
-    if given.seeds < 1 or given.first_seed < 0:
+    if args.seeds < 1 or args.first_seed < 0:
         raise UserError(
-            f"--seeds, --first-seed: got {given.seeds} from {given.first_seed} on; wanted at least one, none below 0"
+            f"--seeds, --first-seed: got {args.seeds} from {args.first_seed} on; wanted at least one, none below 0"
         )
-    seeds = range(given.first_seed, given.first_seed + given.seeds)
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
     items = [
-        Verification(task, seeds[at : at + CHUNK], given.noise) for task in tasks for at in range(0, len(seeds), CHUNK)
+        Verification(task, seeds[at : at + CHUNK], args.noise) for task in tasks for at in range(0, len(seeds), CHUNK)
     ]
     rows: list[VerificationRow] = []
-    with open_runner(given.runner, suite, given.workers) as runner, Bar("verifying", len(tasks) * len(seeds)) as bar:
+    with open_runner(args.runner, suite, args.workers) as runner, Bar("verifying", len(tasks) * len(seeds)) as bar:
         try:
             for _, made in runner.simulate(items):
                 rows += made
                 bar.advance(len(made), made[0].task)
         except WorkError as error:
             raise RunError(f"{error}\n{error.trace}") from error
-    console.print(_table(suite, tasks, rows, given))
+    console.print(_table(suite, tasks, rows, args))
 
 
-def _table(suite: TaskSuite, tasks: Sequence[str], rows: Sequence[VerificationRow], given: Arguments) -> Table:
-    seeds = f"seeds {given.first_seed} to {given.first_seed + given.seeds - 1}"
-    view = Table(title=f"Experts ({suite.protocol}; noise {given.noise:g}; {seeds})")
+def _table(suite: TaskSuite, tasks: Sequence[str], rows: Sequence[VerificationRow], args: Arguments) -> Table:
+    seeds = f"seeds {args.first_seed} to {args.first_seed + args.seeds - 1}"
+    view = Table(title=f"Experts ({suite.protocol}; noise {args.noise:g}; {seeds})")
     scored = suite.best_score > 1
     for column in ("task", "successes", "success rate", "95% interval", *(["score"] * scored), "steps", "longest"):
         view.add_column(column, justify="left" if column == "task" else "right")

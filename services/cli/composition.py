@@ -53,14 +53,14 @@ def config_from(
         raise UserError(
             f"--preset: got {preset!r}; wanted {', '.join(BASE_PRESETS)}, with --suite, or one of {', '.join(PRESETS)}"
         )
-    given = {} if file is None else read_yaml(file, "--config")
+    from_file = {} if file is None else read_yaml(file, "--config")
     try:
-        settings = preset_of(suite or named or DEFAULT_SUITE, size, method or method_named(given)).model_dump()
+        settings = preset_of(suite or named or DEFAULT_SUITE, size, method or method_named(from_file)).model_dump()
     except ValidationError as error:
         raise _no_name(suite) from error
     except UserError as error:
         raise UserError(str(error) if file is None or method is not None else f"{file}: {error}") from error
-    settings = merged(settings, given, str(file))
+    settings = merged(settings, from_file, str(file))
     if method is not None:
         settings["method"]["name"] = method
     if demos is not None:
@@ -68,9 +68,9 @@ def config_from(
     return checked(settings, "" if file is None else f"{file}: ")
 
 
-def method_named(given: Mapping[Any, Any]) -> Any:
+def method_named(from_file: Mapping[Any, Any]) -> Any:
     """Return the method that some settings, by section, are of."""
-    section = given.get("method")
+    section = from_file.get("method")
     return section.get("name", DEFAULT_METHOD) if isinstance(section, Mapping) else DEFAULT_METHOD
 
 

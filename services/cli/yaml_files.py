@@ -16,14 +16,14 @@ MOST_CHARACTERS = 500
 """Of what PyYAML says."""
 
 
-def merged(settings: Mapping[str, Any], given: Mapping[Any, Any], origin: str, prefix: str = "") -> dict[str, Any]:
+def merged(settings: Mapping[str, Any], values: Mapping[Any, Any], origin: str, prefix: str = "") -> dict[str, Any]:
     """Return `settings`, by section, with those that are given in their place; messages begin with `origin`.
 
     Raises:
         UserError: for one that there is not.
     """
     found = dict(settings)
-    for key, value in given.items():
+    for key, value in values.items():
         if key not in found:
             named = key if isinstance(key, str) and len(key) < 50 else shorten(key)
             raise UserError(f"{origin}: got the unknown key {prefix}{named}; wanted one of {', '.join(found)}")
@@ -44,15 +44,15 @@ def read_yaml(file: Path, flag: str) -> dict[Any, Any]:
     try:
         loader = _PlainLoader(read_file(file, MOST_BYTES).decode())
         try:
-            given = loader.get_single_data()
+            values = loader.get_single_data()
         finally:
             loader.dispose()
     # Besides its own errors, PyYAML lets through what comes of dates, numbers and tags that are none.
     except (OSError, yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError) as error:
         raise UserError(f"{flag}: got {file}, {_cut(str(error))}; wanted a readable YAML file") from error
-    if not isinstance(given, dict):
-        raise UserError(f"{flag}: got {file} with {type(given).__name__} in it; wanted keys with values")
-    return given
+    if not isinstance(values, dict):
+        raise UserError(f"{flag}: got {file} with {type(values).__name__} in it; wanted keys with values")
+    return values
 
 
 class _PlainLoader(yaml.SafeLoader):

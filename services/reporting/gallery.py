@@ -45,15 +45,15 @@ class Arguments:
 
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
-    given = parse(Arguments, __doc__ or "", arguments, Arguments())
-    for name in given.suites:
+    args = parse(Arguments, __doc__ or "", arguments, Arguments())
+    for name in args.suites:
         suite = open_suite(SuiteConfig(name=name))
         camera: str | View | None = getattr(suite, "camera", None)
         if camera is None:
             raise UserError(f"--suites: got {name}, which names no camera; wanted suites whose tasks can be drawn")
-        given.output.mkdir(parents=True, exist_ok=True)
-        path = given.output / f"{name}.jpg"
-        draw_gallery(suite, camera, given.seed, path, COLUMNS.get(name.partition("-")[0], 5))
+        args.output.mkdir(parents=True, exist_ok=True)
+        path = args.output / f"{name}.jpg"
+        draw_gallery(suite, camera, args.seed, path, COLUMNS.get(name.partition("-")[0], 5))
         console.print(str(path))
 
 

@@ -106,16 +106,16 @@ def write_run_page(
 
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
-    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
-    finished = FinishedRun.found(given.run, given.runs)
-    path = given.output or finished.folder / "report" / PAGE
+    args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
+    finished = FinishedRun.found(args.run, args.runs)
+    path = args.output or finished.folder / "report" / PAGE
     if path.is_dir():
         raise UserError(f"--output: got {path}, a folder; wanted a file, as {path / PAGE}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    if given.adaptation:
-        with open_runner(given.runner, finished.experiment.suite, given.workers) as runner:
+    if args.adaptation:
+        with open_runner(args.runner, finished.experiment.suite, args.workers) as runner:
             measure(finished, runner)
-    sections = _all_sections(videos=given.videos)
+    sections = _all_sections(videos=args.videos)
     with Bar("report", len(sections)) as bar:
         write_run_page(finished, path, sections, lambda: bar.advance(1))
     console.print(f"report: {path} ({path.stat().st_size / 1e6:.1f} MB)", markup=False)

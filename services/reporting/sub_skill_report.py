@@ -54,21 +54,21 @@ class Arguments:
 
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
-    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
-    _check(given)
+    args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
+    _check(args)
     torch.set_num_threads(1)
-    group = group_runs(_found(given.which, given.runs), given.tasks)
-    sections = sub_skill_sections(group, given.shots, given.rollouts)
-    sections.append(embedding_section(group, given.embedding_shots, given.perplexity, given.seed))
+    group = group_runs(_found(args.which, args.runs), args.tasks)
+    sections = sub_skill_sections(group, args.shots, args.rollouts)
+    sections.append(embedding_section(group, args.embedding_shots, args.perplexity, args.seed))
     lead = [
         Prose("Which sub-skill the high level takes, and where, before adaptation to a task and after it."),
         _runs_table(group),
     ]
-    write_page(given.output, f"Sub-skills on {', '.join(group.held_out)}", lead, sections)
-    console.print(str(given.output), markup=False)
+    write_page(args.output, f"Sub-skills on {', '.join(group.held_out)}", lead, sections)
+    console.print(str(args.output), markup=False)
 
 
-def _check(given: Arguments) -> None:
+def _check(args: Arguments) -> None:
     """Refuse numbers that nothing can be made of.
 
     Raises:
@@ -76,7 +76,7 @@ def _check(given: Arguments) -> None:
     """
     least = {"shots": 1, "rollouts": 0, "embedding_shots": 1, "perplexity": 1, "seed": 0}
     for name, bound in least.items():
-        if not (got := getattr(given, name)) >= bound:
+        if not (got := getattr(args, name)) >= bound:
             raise UserError(f"--{name.replace('_', '-')}: got {got}; wanted at least {bound}")
 
 

@@ -45,14 +45,14 @@ class Arguments:
 
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
-    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, tyro.MISSING))
-    finished = FinishedRun.found(given.run, given.runs)
-    row = _row_of(finished, given)
-    path = given.output or finished.folder / "report" / "videos" / f"{name_of(row)}.{given.format}"
-    if path.suffix != f".{given.format}":
-        raise UserError(f"--output: got {path}; wanted a name that ends in .{given.format}, or another --format")
+    args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, tyro.MISSING))
+    finished = FinishedRun.found(args.run, args.runs)
+    row = _row_of(finished, args)
+    path = args.output or finished.folder / "report" / "videos" / f"{name_of(row)}.{args.format}"
+    if path.suffix != f".{args.format}":
+        raise UserError(f"--output: got {path}; wanted a name that ends in .{args.format}, or another --format")
     with replaying(finished) as replay:
-        sides, replayed = _sides(replay, row, FORMS[given.format], demonstration=given.demonstration)
+        sides, replayed = _sides(replay, row, FORMS[args.format], demonstration=args.demonstration)
     if replayed.difference is not None:
         console.print(f"warning: {replayed.difference}; the film shows what came of it here", markup=False)
     write_film(path, sides)
@@ -60,7 +60,7 @@ def run(arguments: Sequence[str]) -> None:
     console.print(f"{path}, {path.stat().st_size // 1024} KB", markup=False)
 
 
-def _row_of(finished: FinishedRun, given: Arguments) -> EpisodeResult:
+def _row_of(finished: FinishedRun, args: Arguments) -> EpisodeResult:
     """Return the row of the episode that is asked for.
 
     Raises:
@@ -68,17 +68,17 @@ def _row_of(finished: FinishedRun, given: Arguments) -> EpisodeResult:
     """
     rows = finished.episodes
     tasks = dict.fromkeys(row.task for row in rows)
-    if given.task not in tasks:
-        raise UserError(f"--task: got {shorten(given.task)}; wanted one of {finished.name}'s: {', '.join(tasks)}")
-    rows = [row for row in rows if row.task == given.task]
+    if args.task not in tasks:
+        raise UserError(f"--task: got {shorten(args.task)}; wanted one of {finished.name}'s: {', '.join(tasks)}")
+    rows = [row for row in rows if row.task == args.task]
     shots = sorted({row.shots for row in rows})
-    if given.shots not in shots:
+    if args.shots not in shots:
         raise UserError(
-            f"--shots: got {given.shots}; {finished.name} was evaluated with {', '.join(map(str, shots))}; wanted one "
+            f"--shots: got {args.shots}; {finished.name} was evaluated with {', '.join(map(str, shots))}; wanted one "
             "of these, or a run with others: --evaluation.shots"
         )
-    by_number = {row.episode: row for row in rows if row.shots == given.shots}
-    number = min(by_number) if given.episode is None else given.episode
+    by_number = {row.episode: row for row in rows if row.shots == args.shots}
+    number = min(by_number) if args.episode is None else args.episode
     if number not in by_number:
         raise UserError(f"--episode: got {number}; wanted one from {min(by_number)} to {max(by_number)}")
     return by_number[number]

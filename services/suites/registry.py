@@ -109,11 +109,11 @@ def _check_settings(
             raise UserError(f"{where}: {field}: got {got!r}; wanted the {wanted!r} of the settings; see {GUIDE}")
     for field in IN_PROTOCOL:
         usual = SuiteConfig.model_fields[field].default
-        if (given := getattr(config, field)) == usual:
+        if (value := getattr(config, field)) == usual:
             continue
         other = _made(make, config.model_copy(update={field: usual}), where)
         if other.protocol == suite.protocol and (field != "horizon" or other.horizon != suite.horizon):
             raise UserError(
-                f"suite.{field}: got {given!r}; without it {suite.name} has the same protocol, {suite.protocol!r}; "
+                f"suite.{field}: got {value!r}; without it {suite.name} has the same protocol, {suite.protocol!r}; "
                 "leave it out, or, if the suite heeds it, name it in its protocol"
             )

@@ -36,37 +36,35 @@ class Arguments:
 
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
-    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
-    sweeps = [
-        name for name in given.names if any((place / MARK).is_file() for place in (Path(name), given.runs / name))
-    ]
-    if sweeps and len(given.names) > 1:
+    args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
+    sweeps = [name for name in args.names if any((place / MARK).is_file() for place in (Path(name), args.runs / name))]
+    if sweeps and len(args.names) > 1:
         raise UserError(f"RUN: got the sweep {sweeps[0]} with others; wanted it alone, or finished runs only")
-    path = _of_sweep(sweeps[0], given) if sweeps else _of_runs(given)
+    path = _of_sweep(sweeps[0], args) if sweeps else _of_runs(args)
     console.print(f"page: {path}", markup=False)
 
 
-def _of_sweep(name: str, given: Arguments) -> Path:
-    sweep = SweepFolder(find_folder(name, given.runs, MARK, "SWEEP"))
+def _of_sweep(name: str, args: Arguments) -> Path:
+    sweep = SweepFolder(find_folder(name, args.runs, MARK, "SWEEP"))
     rows = sweep.record.sweep.row_names
-    if given.baseline is not None and given.baseline not in rows:
-        raise UserError(f"--baseline: got {given.baseline!r}; wanted one of {', '.join(rows)}")
-    comparison = comparison_of(sweep, given.baseline)
-    path = given.output or sweep.path / "tables" / "report.html"
+    if args.baseline is not None and args.baseline not in rows:
+        raise UserError(f"--baseline: got {args.baseline!r}; wanted one of {', '.join(rows)}")
+    comparison = comparison_of(sweep, args.baseline)
+    path = args.output or sweep.path / "tables" / "report.html"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_sweep_page(tables_of(sweep, comparison), comparison, path)
     return path
 
 
-def _of_runs(given: Arguments) -> Path:
-    if len(given.names) < 2:
-        raise UserError(f"RUN: got {' '.join(given.names) or 'none'}; wanted two finished runs or more, or one sweep")
-    runs = [FinishedRun.found(name, given.runs) for name in given.names]
-    comparison = compare_runs(runs, given.baseline)
-    path = given.output or Path("comparison.html")
+def _of_runs(args: Arguments) -> Path:
+    if len(args.names) < 2:
+        raise UserError(f"RUN: got {' '.join(args.names) or 'none'}; wanted two finished runs or more, or one sweep")
+    runs = [FinishedRun.found(name, args.runs) for name in args.names]
+    comparison = compare_runs(runs, args.baseline)
+    path = args.output or Path("comparison.html")
     path.parent.mkdir(parents=True, exist_ok=True)
-    again = ["python", "-m", "services.report", "compare", *given.names, "--runs", str(given.runs)]
-    again += [] if given.baseline is None else ["--baseline", given.baseline]
+    again = ["python", "-m", "services.report", "compare", *args.names, "--runs", str(args.runs)]
+    again += [] if args.baseline is None else ["--baseline", args.baseline]
     lead = [
         f"{len(runs)} runs on {comparison.suites[0]}; the others are compared with {comparison.baseline}. Runs that "
         "differ only in the seed are one row."

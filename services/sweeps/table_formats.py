@@ -229,6 +229,6 @@ class Arguments:
 
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
-    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
-    sweep = SweepFolder(find_folder(given.sweep, given.runs, MARK, "SWEEP"))
+    args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
+    sweep = SweepFolder(find_folder(args.sweep, args.runs, MARK, "SWEEP"))
     show(write_tables(sweep), sweep)

@@ -49,18 +49,18 @@ def run(arguments: Sequence[str]) -> None:
         UserError: if there is no such run.
         RunError: if MLflow does not take the records, or another process is delivering them.
     """
-    given = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
+    args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
     uri = tracking_uri()
-    if given.action == "ui":
-        _serve(uri, given.port)
-    folder = find_folder(given.run, given.runs, "tracking.jsonl", "RUN")
-    if given.action == "report":
+    if args.action == "ui":
+        _serve(uri, args.port)
+    folder = find_folder(args.run, args.runs, "tracking.jsonl", "RUN")
+    if args.action == "report":
         _report(folder, uri)
         return
     for own in (folder, *sorted(spool.parent for spool in folder.glob("trials/*/tracking.jsonl"))):  # of a sweep
         delivery = Delivery(own, uri)
         try:
-            _flush(delivery, own, uri) if given.action == "flush" else _status(delivery)
+            _flush(delivery, own, uri) if args.action == "flush" else _status(delivery)
         finally:
             delivery.close()
 

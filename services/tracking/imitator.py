@@ -50,10 +50,10 @@ class Imitator(PythonModel):
             UserError: for a row that is not such.
             RunError: where adaptation has diverged.
         """
-        given = params or {}
+        settings = params or {}
         fine_tuning = FineTuning(
-            int(given.get("fine_tuning_steps", self._evaluation.fine_tuning_steps)),
-            float(given.get("learning_rate", self._evaluation.learning_rate)),
+            int(settings.get("fine_tuning_steps", self._evaluation.fine_tuning_steps)),
+            float(settings.get("learning_rate", self._evaluation.learning_rate)),
         )
         return [self.answer(row, fine_tuning) for row in model_input.to_dict("records")]
 

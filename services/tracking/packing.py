@@ -28,11 +28,11 @@ def packed(support: Sequence[Demonstration], observation: Float32[np.ndarray, " 
     return {"support": demonstrations, "observation": observation.tolist()}
 
 
-def unpacked(given: Mapping[str, Any], obs_dim: int, action_dim: int) -> Question:
+def unpacked(request: Mapping[str, Any], obs_dim: int, action_dim: int) -> Question:
     """Return what a model's input asks.
 
     Args:
-        given: ``support``, a list of demonstrations with ``observations`` and ``actions``, one row a step;
+        request: ``support``, a list of demonstrations with ``observations`` and ``actions``, one row a step;
             ``observation``; and, after the first step, the ``memory``.
         obs_dim: numbers in an observation.
         action_dim: numbers in an action.
@@ -40,13 +40,13 @@ def unpacked(given: Mapping[str, Any], obs_dim: int, action_dim: int) -> Questio
     Raises:
         UserError: names the part that is wrong, what it got and what was wanted.
     """
-    support = given.get("support")
+    support = request.get("support")
     if not isinstance(support, Sequence | np.ndarray) or isinstance(support, str) or len(support) == 0:
         raise UserError(f"support: got {shorten(support)}; wanted a list of at least one demonstration")
-    observation = _numbers(given.get("observation"), "observation", (obs_dim,))
+    observation = _numbers(request.get("observation"), "observation", (obs_dim,))
     if not np.isfinite(observation).all():
         raise UserError("observation: got numbers that are not finite; wanted real numbers only")
-    memory = given.get("memory")
+    memory = request.get("memory")
     return Question(
         tuple(_demonstration(one, number, obs_dim, action_dim) for number, one in enumerate(support)),
         observation,
@@ -54,20 +54,20 @@ def unpacked(given: Mapping[str, Any], obs_dim: int, action_dim: int) -> Questio
     )
 
 
-def _memory(given: Any) -> Int64[np.ndarray, " memory_dim"]:
+def _memory(memory: Any) -> Int64[np.ndarray, " memory_dim"]:
     try:
-        return np.asarray(given, np.int64)
+        return np.asarray(memory, np.int64)
     except (TypeError, ValueError) as error:
-        raise UserError(f"memory: got {shorten(given)}; wanted whole numbers, as the step before returned") from error
+        raise UserError(f"memory: got {shorten(memory)}; wanted whole numbers, as the step before returned") from error
 
 
-def _demonstration(given: Any, number: int, obs_dim: int, action_dim: int) -> Demonstration:
+def _demonstration(fields: Any, number: int, obs_dim: int, action_dim: int) -> Demonstration:
     name = f"support[{number}]"
-    if not isinstance(given, Mapping) or not {"observations", "actions"} <= given.keys():
-        got = ", ".join(map(str, given)) if isinstance(given, Mapping) else type(given).__name__
+    if not isinstance(fields, Mapping) or not {"observations", "actions"} <= fields.keys():
+        got = ", ".join(map(str, fields)) if isinstance(fields, Mapping) else type(fields).__name__
         raise UserError(f"{name}: got {got or 'nothing'}; wanted a demonstration's observations and actions")
-    observations = _numbers(given["observations"], f"{name}.observations", (-1, obs_dim))
-    actions = _numbers(given["actions"], f"{name}.actions", (-1, action_dim))
+    observations = _numbers(fields["observations"], f"{name}.observations", (-1, obs_dim))
+    actions = _numbers(fields["actions"], f"{name}.actions", (-1, action_dim))
     if len(observations) != len(actions):
         raise UserError(
             f"{name}: got {len(observations)} observations for {len(actions)} actions; wanted one action for each"
@@ -78,14 +78,14 @@ def _demonstration(given: Any, number: int, obs_dim: int, action_dim: int) -> De
         raise UserError(f"{name}: {error}") from error
 
 
-def _numbers(given: Any, name: str, wanted: tuple[int, ...]) -> np.ndarray:
+def _numbers(numbers: Any, name: str, wanted: tuple[int, ...]) -> np.ndarray:
     """Return numbers of a shape, in which -1 stands for any length."""
     in_words = f"{wanted[-1]} numbers" if len(wanted) == 1 else f"one row of {wanted[-1]} numbers for each step"
     try:
-        rows = [np.asarray(row, np.float32) for row in given] if len(wanted) == 2 else given
+        rows = [np.asarray(row, np.float32) for row in numbers] if len(wanted) == 2 else numbers
         found = np.asarray(rows, np.float32)
     except (TypeError, ValueError) as error:
-        raise UserError(f"{name}: got {shorten(given)}; wanted {in_words}") from error
+        raise UserError(f"{name}: got {shorten(numbers)}; wanted {in_words}") from error
     if found.ndim != len(wanted) or found.shape[-1] != wanted[-1]:
         raise UserError(f"{name}: got the shape {found.shape}; wanted {in_words}")
     return found
