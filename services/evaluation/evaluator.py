@@ -40,8 +40,8 @@ class Tallies:
 
     def __iter__(self) -> Iterator[Tally]:
         """Go through the counts so far, those of meta-training tasks first."""
-        found = [Tally(*where, *counts) for where, counts in list(self._counts.items())]
-        return iter(sorted(found, key=lambda tally: (tally.split == "meta-testing", tally.shots)))
+        tallies = [Tally(*where, *counts) for where, counts in list(self._counts.items())]
+        return iter(sorted(tallies, key=lambda tally: (tally.split == "meta-testing", tally.shots)))
 
     def add(self, adaptation: Adaptation, outcome: AdaptationOutcome) -> None:
         """Count an adaptation's episodes."""
@@ -222,9 +222,9 @@ class Evaluations:
             tallies.add(adaptation, outcome)
         tallies.finish()
         self.latest = {"success": list(tallies), "after": iteration}
-        found = summary_rows(evaluation.episodes, evaluation.best_score, self._evaluator.config.method)
-        self._tracker.metrics(iteration, rates(found, sub_skill_shares(evaluation.adaptations)))
-        success_rates = "; ".join(f"{cell.split} {cell.shots}-shot {cell.success_rate:.3f}" for cell in found)
+        rows = summary_rows(evaluation.episodes, evaluation.best_score, self._evaluator.config.method)
+        self._tracker.metrics(iteration, rates(rows, sub_skill_shares(evaluation.adaptations)))
+        success_rates = "; ".join(f"{cell.split} {cell.shots}-shot {cell.success_rate:.3f}" for cell in rows)
         logger.info(f"success rates after {iteration} iterations: {success_rates}")
 
 

@@ -50,17 +50,17 @@ def figure(table: str, row: str, suite: str, split: Split, shots: int) -> Publis
         split: of its tasks.
         shots: demonstrations adapted to; Table 5 does not tell how many: its figures stand beside all.
     """
-    found, title = _tables()[table]["rows"], f"Table {table.removeprefix('table')}"
+    rows, title = _tables()[table]["rows"], f"Table {table.removeprefix('table')}"
     if table == "table5":
-        if suite not in KITCHENS or split != "meta-testing" or row not in found[KITCHENS.index(suite)]:
+        if suite not in KITCHENS or split != "meta-testing" or row not in rows[KITCHENS.index(suite)]:
             return None
-        value, spread = found[KITCHENS.index(suite)][row]
+        value, spread = rows[KITCHENS.index(suite)][row]
         return Published(value=value, spread=spread, table=title)
-    key, figures = f"{BENCHMARKS.get(suite)}/{split}/{shots}-shot", found.get(row, {})
-    means = figures.get("mean", figures)
+    key, by_condition = f"{BENCHMARKS.get(suite)}/{split}/{shots}-shot", rows.get(row, {})
+    means = by_condition.get("mean", by_condition)
     if key not in means:
         return None
-    return Published(value=means[key], spread=figures.get("spread", {}).get(key), table=title)
+    return Published(value=means[key], spread=by_condition.get("spread", {}).get(key), table=title)
 
 
 def figure_of(method: MethodConfig, suite: str, split: Split, shots: int) -> Published | None:

@@ -118,13 +118,13 @@ def summary_rows(episodes: Sequence[EpisodeResult], best_score: int, method: Met
     Where the score of an episode in which all is done is more than 1, scores are given too.
     """
     key = attrgetter("suite", "split", "shots")
-    found = []
+    rows = []
     for (suite, split, shots), group in groupby(sorted(episodes, key=key), key=key):
-        rows = list(group)
-        rate = success_rate([row.success for row in rows])
-        tasks = dict.fromkeys(row.task for row in rows)
-        per_task = {task: float(np.mean([row.success for row in rows if row.task == task])) for task in tasks}
-        found.append(
+        of_group = list(group)
+        rate = success_rate([row.success for row in of_group])
+        tasks = dict.fromkeys(row.task for row in of_group)
+        per_task = {task: float(np.mean([row.success for row in of_group if row.task == task])) for task in tasks}
+        rows.append(
             SummaryRow(
                 suite=suite,
                 split=split,
@@ -134,11 +134,11 @@ def summary_rows(episodes: Sequence[EpisodeResult], best_score: int, method: Met
                 low=rate.low,
                 high=rate.high,
                 per_task=per_task,
-                score=_score(rows, best_score) if best_score > 1 else None,
+                score=_score(of_group, best_score) if best_score > 1 else None,
                 paper=figure_of(method, suite, split, shots),
             )
         )
-    return sorted(found, key=lambda cell: (cell.suite, cell.split == "meta-testing", cell.shots))
+    return sorted(rows, key=lambda cell: (cell.suite, cell.split == "meta-testing", cell.shots))
 
 
 def _score(rows: Sequence[EpisodeResult], best: int) -> Score:
@@ -176,7 +176,7 @@ def sub_skill_shares(adaptations: Sequence[AdaptationResult]) -> dict[Split, Sub
 
 def rates(rows: Sequence[SummaryRow], use: Mapping[Split, SubSkillShares]) -> dict[str, float]:
     """Return the metrics of an evaluation by the names they are tracked under: of each task, and in all."""
-    found: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     for cell in rows:
         name, score = f"{cell.split}/{cell.shots}-shot", cell.score
         means: dict[str, float | None] = {"success_rate": cell.success_rate, "success_rate_low": cell.low}
@@ -184,11 +184,11 @@ def rates(rows: Sequence[SummaryRow], use: Mapping[Split, SubSkillShares]) -> di
         if score is not None:
             means |= {"score": score.mean, f"score_best_{BEST}": score.mean_of_best}
             means |= {"score_low": score.low, "score_high": score.high}
-        found |= {f"{metric}/{name}": value for metric, value in means.items() if value is not None}
-        found |= {f"task_success_rate/{name}/{task}": rate for task, rate in cell.per_task.items()}
-    for split, figures in use.items():
-        found |= {f"agreement/{split}": figures.agreement, f"sub_skill_entropy/{split}": figures.entropy}
-    return found
+        metrics |= {f"{metric}/{name}": value for metric, value in means.items() if value is not None}
+        metrics |= {f"task_success_rate/{name}/{task}": rate for task, rate in cell.per_task.items()}
+    for split, of_split in use.items():
+        metrics |= {f"agreement/{split}": of_split.agreement, f"sub_skill_entropy/{split}": of_split.entropy}
+    return metrics
 
 
 def summarise(

@@ -27,7 +27,7 @@ class FinishedRun(EvaluationFolder):
     """What ``meta_train`` left behind; each file is read when it is asked for, once."""
 
     @staticmethod
-    def found(name: str, runs: Path) -> "FinishedRun":
+    def find(name: str, runs: Path) -> "FinishedRun":
         """Return a run by its name in `runs`, or by its folder.
 
         Raises:

@@ -99,15 +99,15 @@ def measure(
     folder = run.folder / FOLDER
     folder.mkdir(exist_ok=True)
     write_file(folder / PLAN, plan.model_dump_json(indent=1) + "\n")
-    for place, count in enumerate(plan.steps, start=1):
+    for number, count in enumerate(plan.steps, start=1):
         experiment = Experiment(with_evaluation(run.config, plan.at(count)), run.experiment.store)
         evaluator = experiment.evaluator(runner, run.demonstrations, plan.tasks)
-        own = _folder_of(run, count)
-        if not _is_measured(own, evaluator, plan, count):
-            console.print(f"{count} fine-tuning steps, {place} of {len(plan.steps)}", markup=False)
-            (own / IMITATION).unlink(missing_ok=True)
-            experiment.evaluate(runner, run.demonstrations, run.checkpoint, own, plan.tasks)
-            _measure_imitation(run, runner, evaluator, own)
+        rows_folder = _folder_of(run, count)
+        if not _is_measured(rows_folder, evaluator, plan, count):
+            console.print(f"{count} fine-tuning steps, {number} of {len(plan.steps)}", markup=False)
+            (rows_folder / IMITATION).unlink(missing_ok=True)
+            experiment.evaluate(runner, run.demonstrations, run.checkpoint, rows_folder, plan.tasks)
+            _measure_imitation(run, runner, evaluator, rows_folder)
     return plan
 
 
@@ -118,16 +118,16 @@ def _planned(
     steps: Sequence[int] | None,
     episodes: int,
 ) -> CurvePlan:
-    known, own = [task for _, task in run.experiment.tasks], run.config.evaluation
+    known, evaluation_of_run = [task for _, task in run.experiment.tasks], run.config.evaluation
     wanted = tuple(dict.fromkeys(tasks or run.experiment.suite.test_tasks[:MOST_TASKS]))
     if unknown := [task for task in wanted if task not in known]:
         raise UserError(f"tasks: got {', '.join(unknown)}; wanted some of the run's, {', '.join(known)}")
     sizes = _possible(run, wanted, shots)
     draws = DRAWS if DRAWS * max(sizes) <= run.config.demonstrations.held_out else 1
-    evaluation = own.model_copy(
+    evaluation = evaluation_of_run.model_copy(
         update={"shots": sizes, "episodes": episodes, "support_draws": min(draws, episodes), "every": None}
     )
-    counts = steps or [max(round(part * own.fine_tuning_steps), int(part > 0)) for part in PARTS]
+    counts = steps or [max(round(part * evaluation_of_run.fine_tuning_steps), int(part > 0)) for part in PARTS]
     return CurvePlan(
         checkpoint=run.checkpoint.digest, tasks=wanted, steps=tuple(sorted(set(counts))), evaluation=evaluation
     )
@@ -207,15 +207,15 @@ def _plan_of(run: FinishedRun) -> CurvePlan | None:
 
 def points(run: FinishedRun) -> list[Point]:
     """Return what was measured of the run's newest checkpoint, by shots and steps; none if nothing was."""
-    plan, found = _plan_of(run), []
+    plan, measured = _plan_of(run), []
     for steps in plan.steps if plan else ():
         episodes, errors = _rows(_folder_of(run, steps))
         for shots in dict.fromkeys(row.shots for row in errors):
-            own = [row for row in errors if row.shots == shots]
+            of_shots = [row for row in errors if row.shots == shots]
             rate = success_rate([row.success for row in episodes if row.shots == shots])
-            held_out, support = _mean([row.held_out_error for row in own]), _mean([row.support_error for row in own])
-            found.append(Point(shots, steps, rate, held_out, support))
-    return sorted(found, key=lambda point: (point.shots, point.steps))
+            held_out = _mean([row.held_out_error for row in of_shots])
+            measured.append(Point(shots, steps, rate, held_out, _mean([row.support_error for row in of_shots])))
+    return sorted(measured, key=lambda point: (point.shots, point.steps))
 
 
 def _mean(errors: Sequence[float | None]) -> float | None:
@@ -225,10 +225,10 @@ def _mean(errors: Sequence[float | None]) -> float | None:
 
 def adaptation_section(run: FinishedRun) -> Section:
     """Return the curves and the table of what `measure` has found; without parts if it was not called."""
-    title, plan, found = "Adaptation", _plan_of(run), points(run)
-    if plan is None or not found:
+    title, plan, measured = "Adaptation", _plan_of(run), points(run)
+    if plan is None or not measured:
         return Section(title, [])
-    lacking = [str(steps) for steps in plan.steps if steps not in {point.steps for point in found}]
+    lacking = [str(steps) for steps in plan.steps if steps not in {point.steps for point in measured}]
     wanted = [str(size) for size in SHOTS if size not in plan.evaluation.shots]
     parts: list[Part] = [
         Prose(
@@ -241,26 +241,27 @@ def adaptation_section(run: FinishedRun) -> Section:
             + (f" Not measured for {', '.join(wanted)} shots." if wanted else "")
             + (f" Measuring was stopped before {', '.join(lacking)} steps." if lacking else "")
         ),
-        _draw(found),
-        _table(found),
+        _draw(measured),
+        _table(measured),
     ]
     return Section(title, parts)
 
 
-def _draw(found: Sequence[Point]) -> Picture:
+def _draw(measured: Sequence[Point]) -> Picture:
     """Draw a line for each number of shots, at places side by side for each number of steps."""
-    sizes = list(dict.fromkeys(point.shots for point in found))
-    steps = sorted({point.steps for point in found})
+    sizes = list(dict.fromkeys(point.shots for point in measured))
+    steps = sorted({point.steps for point in measured})
     with panels(1, 3, width=10.0, height=3.4) as (figure, axes):
         success, held_out, support = axes
-        for place, size in enumerate(sizes):
-            own = [point for point in found if point.shots == size]
-            at = np.array([steps.index(point.steps) for point in own]) + APART * (place - (len(sizes) - 1) / 2)
-            style = {"color": colour_of(place), "marker": marker_of(place), "markersize": 4, "label": f"{size}-shot"}
-            rates, reach = [point.success.mean for point in own], np.transpose([point.success.reach for point in own])
+        for index, size in enumerate(sizes):
+            of_size = [point for point in measured if point.shots == size]
+            at = np.array([steps.index(point.steps) for point in of_size]) + APART * (index - (len(sizes) - 1) / 2)
+            style = {"color": colour_of(index), "marker": marker_of(index), "markersize": 4, "label": f"{size}-shot"}
+            reach = np.transpose([point.success.reach for point in of_size])
+            rates = [point.success.mean for point in of_size]
             success.errorbar(at, rates, yerr=reach, elinewidth=0.8, capsize=2, **style)
-            held_out.plot(at, np.array([point.held_out_error for point in own], float), **style)
-            support.plot(at, np.array([point.support_error for point in own], float), **style)
+            held_out.plot(at, np.array([point.held_out_error for point in of_size], float), **style)
+            support.plot(at, np.array([point.support_error for point in of_size], float), **style)
         success.set(title="success", ylabel="success rate", ylim=(-0.02, 1.02))
         for axis, title in ((held_out, "loss on held-out demonstrations"), (support, "loss on the support set")):
             axis.set(title=title, ylabel="squared error of actions")
@@ -269,16 +270,16 @@ def _draw(found: Sequence[Point]) -> Picture:
             axis.set_xticks(range(len(steps)), map(str, steps))
             axis.set_xlabel("fine-tuning steps, not to scale")
         legend_of_markers(figure, [f"{size}-shot" for size in sizes], "solid")
-        told = "; ".join(f"{size}-shot {_course(found, size)}" for size in sizes)
-        return drawn(figure, "Success and loss over fine-tuning steps", f"Bars are 95% Wilson intervals. {told}.")
+        text = "; ".join(f"{size}-shot {_course(measured, size)}" for size in sizes)
+        return drawn(figure, "Success and loss over fine-tuning steps", f"Bars are 95% Wilson intervals. {text}.")
 
 
-def _course(found: Sequence[Point], shots: int) -> str:
-    own = [point for point in found if point.shots == shots]
-    return "success " + ", ".join(f"{point.success.mean:.2f} after {point.steps} steps" for point in own)
+def _course(measured: Sequence[Point], shots: int) -> str:
+    of_shots = [point for point in measured if point.shots == shots]
+    return "success " + ", ".join(f"{point.success.mean:.2f} after {point.steps} steps" for point in of_shots)
 
 
-def _table(found: Sequence[Point]) -> DataTable:
+def _table(measured: Sequence[Point]) -> DataTable:
     rows = [
         [
             point.shots,
@@ -289,7 +290,7 @@ def _table(found: Sequence[Point]) -> DataTable:
             "" if point.held_out_error is None else f"{point.held_out_error:.4f}",
             "" if point.support_error is None else f"{point.support_error:.4f}",
         ]
-        for point in found
+        for point in measured
     ]
     head = ["shots", "fine-tuning steps", "success rate", "95% interval", "episodes"]
     head += ["loss on held-out demonstrations", "loss on the support set"]

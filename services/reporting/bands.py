@@ -38,12 +38,12 @@ def curve_of(metrics: Metrics, name: str) -> Curve | None:
     steps = sorted(set.intersection(*map(set, by_seed))) if by_seed else []
     if not steps:
         return None
-    values = _in_means(np.array([[own[step] for step in steps] for own in by_seed]))
+    values = _in_means(np.array([[of_seed[step] for step in steps] for of_seed in by_seed]))
     low, high = values.min(0), values.max(0)
     rate, _, rest = name.partition("/")
     if len(seeds) == 1 and any(f"{rate}_low/{rest}" in row for row in seeds[0]):
         both = [_by_iteration(seeds[0], f"{rate}_{end}/{rest}") for end in ("low", "high")]
-        low, high = _in_means(np.array([[own[step] for step in steps] for own in both]))
+        low, high = _in_means(np.array([[of_seed[step] for step in steps] for of_seed in both]))
     ends = [steps[places][-1] for places in chunks_of(len(steps), POINTS)]
     return Curve(np.array(ends, float), values.mean(0), low, high)
 
@@ -67,26 +67,27 @@ def curves(title: str, rows: Mapping[str, Metrics], names: Mapping[str, str], *,
 
     The names of the metrics are by the words above their panels; nothing is drawn if no row has two points of any.
     """
-    found = {words: {row: curve_of(metrics, name) for row, metrics in rows.items()} for words, name in names.items()}
-    drawable = {
-        words: own for words, own in found.items() if any(curve and len(curve.mean) > 1 for curve in own.values())
-    }
+    drawable: dict[str, dict[str, Curve | None]] = {}
+    for words, name in names.items():
+        by_row = {row: curve_of(metrics, name) for row, metrics in rows.items()}
+        if any(curve and len(curve.mean) > 1 for curve in by_row.values()):
+            drawable[words] = by_row
     if not drawable:
         return None
     columns = min(len(drawable), COLUMNS)
     lines = -(-len(drawable) // columns)
-    told: dict[str, list[str]] = {}
+    texts: dict[str, list[str]] = {}
     with panels(lines, columns, width=max(5.3, 3.6 * columns), height=0.5 + 2.7 * lines) as (figure, axes):
         legend = {}
-        for axis, (words, own) in zip(axes, drawable.items(), strict=False):
-            for index, (row, curve) in enumerate(own.items()):
+        for axis, (words, by_row) in zip(axes, drawable.items(), strict=False):
+            for index, (row, curve) in enumerate(by_row.items()):
                 if curve is not None:
                     legend[row] = draw_curve(axis, index, curve, row, "o" if len(curve.mean) < 20 else None, 3)
                     ends = f"from {curve.mean[0]:.3g} to {curve.mean[-1]:.3g}"
-                    told.setdefault(words, []).append(f"{row} {ends}")
+                    texts.setdefault(words, []).append(f"{row} {ends}")
             axis.set(title=words, xlabel="iteration")
             axis.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-            low, high = (of([of(end) for curve in own.values() if curve for end in curve[2:]]) for of in (min, max))
+            low, high = (of([of(end) for curve in by_row.values() if curve for end in curve[2:]]) for of in (min, max))
             if rate:
                 axis.set_ylim(-0.02, 1.02)
             elif 0 < 10 * low < high:
@@ -94,7 +95,7 @@ def curves(title: str, rows: Mapping[str, Metrics], names: Mapping[str, str], *,
         for axis in axes[len(drawable) :]:
             axis.remove()
         figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=4, fontsize="small")
-        ends = "; ".join(f"{words}: {', '.join(rows)}" for words, rows in told.items())
+        ends = "; ".join(f"{words}: {', '.join(rows)}" for words, rows in texts.items())
         return drawn(figure, title, f"{ends}.")
 
 

@@ -26,7 +26,7 @@ class Segment(NamedTuple):
     sub_skill: int
 
 
-class Usage(NamedTuple):
+class TimelineStatistics(NamedTuple):
     """How sub-skills are used in some episodes, or along some demonstrations."""
 
     episodes: int
@@ -59,7 +59,7 @@ def segments(timeline: Int64[np.ndarray, " steps"]) -> list[Segment]:
     ]
 
 
-def usage(timelines: Sequence[Int64[np.ndarray, " _"]], sub_skills: int) -> Usage:
+def statistics(timelines: Sequence[Int64[np.ndarray, " _"]], sub_skills: int) -> TimelineStatistics:
     """Return how sub-skills are used in episodes, none of which goes over into another.
 
     Each number of a timeline is at least 0 and below K, the number of `sub_skills`.
@@ -71,7 +71,7 @@ def usage(timelines: Sequence[Int64[np.ndarray, " _"]], sub_skills: int) -> Usag
             steps[segment.sub_skill] += segment.steps
             kept[segment.sub_skill] += 1
         np.add.at(transitions, (timeline[:-1], timeline[1:]), 1)
-    return Usage(
+    return TimelineStatistics(
         episodes=len(timelines),
         steps=int(steps.sum()),
         shares=steps / max(1, steps.sum()),
@@ -81,7 +81,7 @@ def usage(timelines: Sequence[Int64[np.ndarray, " _"]], sub_skills: int) -> Usag
     )
 
 
-def shares_in_words(shares: Float64[np.ndarray, " sub_skills"]) -> str:
+def describe_shares(shares: Float64[np.ndarray, " sub_skills"]) -> str:
     """Return the share of each sub-skill that is used at all."""
     return ", ".join(f"sub-skill {k} {share:.0%}" for k, share in enumerate(shares) if share)
 
@@ -103,9 +103,9 @@ class Choices(NamedTuple):
     timelines: Mapping[str, Sequence[Timeline]]
     """Along held-out demonstrations, and in rollouts; a policy that has diverged has none of these."""
 
-    def usage(self, on: str) -> Usage:
+    def statistics(self, on: str) -> TimelineStatistics:
         """Return the statistics of one kind of timelines."""
-        return usage([timeline.sub_skills for timeline in self.timelines[on]], self.sub_skills)
+        return statistics([timeline.sub_skills for timeline in self.timelines[on]], self.sub_skills)
 
 
 def choices_on(group: RunGroup, task: str, shots: int, rollouts: int) -> list[Choices]:
@@ -117,7 +117,7 @@ def choices_on(group: RunGroup, task: str, shots: int, rollouts: int) -> list[Ch
         UserError: if no demonstration is left to look at.
     """
     support, others = group.shots(task, shots)
-    suite, found = group.experiment.suite, []
+    suite, choices = group.experiment.suite, []
     with ExitStack() as open_envs:
         envs = [build_env(suite, task) for _ in range(rollouts)]
         for env in envs:
@@ -129,15 +129,15 @@ def choices_on(group: RunGroup, task: str, shots: int, rollouts: int) -> list[Ch
                 along = [Timeline(other.id, policy.sub_skill_use(other).chosen) for other in others]
                 acted = _acted(policy, run, task, envs, suite.horizon)
                 timelines = {DEMONSTRATIONS: along, ROLLOUTS: acted}
-                found.append(Choices(label, adaptation, sub_skills_of(run.config.method), timelines))
-    return found
+                choices.append(Choices(label, adaptation, sub_skills_of(run.config.method), timelines))
+    return choices
 
 
 def _acted(policy: Policy, run: FinishedRun, task: str, envs: Sequence[Environment], horizon: int) -> list[Timeline]:
     """Let a policy act in the episodes of the evaluation's first support set."""
     if not envs:
         return []
-    numbers = [run.config.evaluation.support_draws * place for place in range(len(envs))]
+    numbers = [run.config.evaluation.support_draws * index for index in range(len(envs))]
     seeds = [named_seed(run.config.seed, "evaluation", task, number) for number in numbers]
     rollouts = rollout(policy, envs, seeds, horizon)
     if any(episode.diverged for episode in rollouts):

@@ -108,23 +108,23 @@ def training_curves(finished: FinishedRun) -> Section:
     if len(finished.evaluations) > 1:
         parts += draw_success(finished.evaluations, finished.config.method, finished.best_score)
     if pictures := draw_metrics(finished.metrics):
-        told = (
+        text = (
             f"A curve goes through {DRAWN} points at most: each is the mean of as many iterations, and the band around "
             f"it holds the middle {MIDDLE[1] - MIDDLE[0]}% of them."
         )
-        parts += [Prose(told), *pictures]
+        parts += [Prose(text), *pictures]
     return Section("Training curves", parts)
 
 
 def draw_metrics(metrics: Metrics) -> list[Picture]:
     """Return the pictures of what was measured in each iteration; one in which nothing would be is left out."""
     names = [name for name in dict.fromkeys(name for row in metrics for name in row) if not _is_unshown(name)]
-    known = {name for panels_ in PICTURES.values() for panel in panels_ for name in _held(panel, names)}
+    known = {name for panels_ in PICTURES.values() for panel in panels_ for name in _in_panel(panel, names)}
     others = [Panel(_words(name), "", (name,)) for name in names if name not in known]
     pictures = []
     for title, panels_ in {**PICTURES, OTHERS: others}.items():
-        curves = {panel: {_words(name): _curve(metrics, name) for name in _held(panel, names)} for panel in panels_}
-        if filled := {panel: found for panel, found in curves.items() if found}:
+        curves = {panel: {_words(name): _curve(metrics, name) for name in _in_panel(panel, names)} for panel in panels_}
+        if filled := {panel: lines for panel, lines in curves.items() if lines}:
             pictures.append(_picture(title, filled))
     return pictures
 
@@ -134,8 +134,8 @@ def _is_unshown(name: str) -> bool:
     return name in UNSHOWN or name.startswith("seconds/") or name.partition("/")[2].startswith(SPLITS)
 
 
-def _held(panel: Panel, names: Sequence[str]) -> list[str]:
-    return [name for own in panel.names for name in names if name == own or (own == SHARE and name.startswith(own))]
+def _in_panel(panel: Panel, names: Sequence[str]) -> list[str]:
+    return [name for of in panel.names for name in names if name == of or (of == SHARE and name.startswith(of))]
 
 
 def _words(name: str) -> str:
@@ -162,10 +162,10 @@ def _picture(title: str, filled: Mapping[Panel, Mapping[str, Curve]]) -> Picture
                 axis.set(yscale="linear", ylim=(0, 1.02))
         for axis in axes[len(filled) :]:
             axis.remove()
-        return drawn(figure, title, " ".join(_in_words(panel, curves) for panel, curves in filled.items()))
+        return drawn(figure, title, " ".join(_describe(panel, curves) for panel, curves in filled.items()))
 
 
-def _in_words(panel: Panel, curves: Mapping[str, Curve]) -> str:
+def _describe(panel: Panel, curves: Mapping[str, Curve]) -> str:
     each = [f"{label} from {curve.mean[0]:.3g} to {curve.mean[-1]:.3g}" for label, curve in curves.items()]
     return f"{panel.title.capitalize()}: {'; '.join(each)}."
 
@@ -199,10 +199,12 @@ def draw_success(
     evaluations: Mapping[int, Sequence[EpisodeResult]], method: MethodConfig, best_score: int
 ) -> list[Picture]:
     """Return how success, and the score where there is one, went over the iterations."""
-    found = {iteration: summary_rows(evaluations[iteration], best_score, method) for iteration in sorted(evaluations)}
+    by_iteration = {
+        iteration: summary_rows(evaluations[iteration], best_score, method) for iteration in sorted(evaluations)
+    }
     rates: Lines = defaultdict(list)
     scores: Lines = defaultdict(list)
-    for iteration, of_iteration in found.items():
+    for iteration, of_iteration in by_iteration.items():
         for cell in of_iteration:
             key = cell.split, cell.shots
             rates[key].append((iteration, cell.success_rate, cell.low, cell.high))
@@ -215,17 +217,17 @@ def draw_success(
 
 def _progress(title: str, what: str, best: int, lines: Lines) -> Picture:
     splits = list(dict.fromkeys(split for split, _ in lines))
-    told = []
+    texts = []
     with panels(1, len(splits), width=4.8 * len(splits), height=3.1) as (figure, axes):
         for axis, split in zip(axes, splits, strict=True):
-            for index, (key, points) in enumerate((key, found) for key, found in lines.items() if key[0] == split):
+            for index, (key, points) in enumerate(line for line in lines.items() if line[0][0] == split):
                 iterations, means, low, high = map(list, zip(*points, strict=True))
                 label = f"{key[1]}-shot"
                 axis.plot(iterations, means, label=label, marker=marker_of(index), **style_of(index))
                 axis.fill_between(iterations, low, high, color=colour_of(index), alpha=0.2, linewidth=0)
-                told.append(
+                texts.append(
                     f"{split}, {label}: " + ", ".join(f"{m:.2f} at {i}" for i, m in zip(iterations, means, strict=True))
                 )
             axis.set(title=split, xlabel="iteration", ylabel=what, ylim=(0, 1.03 * best))
             axis.legend(fontsize="small")
-        return drawn(figure, title, f"The {what} after so many iterations, with 95% intervals. {'; '.join(told)}.")
+        return drawn(figure, title, f"The {what} after so many iterations, with 95% intervals. {'; '.join(texts)}.")

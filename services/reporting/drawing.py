@@ -103,11 +103,11 @@ def drawn(figure: Figure, title: str, description: str) -> Picture:
     figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     svg = text.getvalue()
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
-    svg = re.sub(
-        r'\b[dxy]="[^"]*"', lambda places: re.sub(r"(\.\d\d)\d+", r"\1", places[0]), svg
-    )  # it is then half as long
-    own = f"p{next(_numbers)}-"
-    svg = re.sub(r'(\bid="|xlink:href="#|url\(#)', rf"\g<1>{own}", svg).replace(INK, "currentColor")
-    head = f'role="img" aria-labelledby="{own}title {own}description"'
-    told = f'<title id="{own}title">{escape(title)}</title><desc id="{own}description">{escape(description)}</desc>'
-    return Picture(title, description, Markup(re.sub(r"<svg ([^>]*)>", rf"<svg {head} \1>" + told, svg, count=1)))
+    # Half as long with two decimals.
+    svg = re.sub(r'\b[dxy]="[^"]*"', lambda numbers: re.sub(r"(\.\d\d)\d+", r"\1", numbers[0]), svg)
+    prefix = f"p{next(_numbers)}-"
+    svg = re.sub(r'(\bid="|xlink:href="#|url\(#)', rf"\g<1>{prefix}", svg).replace(INK, "currentColor")
+    head = f'role="img" aria-labelledby="{prefix}title {prefix}description"'
+    texts = f'<title id="{prefix}title">{escape(title)}</title>'
+    texts += f'<desc id="{prefix}description">{escape(description)}</desc>'
+    return Picture(title, description, Markup(re.sub(r"<svg ([^>]*)>", rf"<svg {head} \1>" + texts, svg, count=1)))

@@ -9,7 +9,7 @@ from jaxtyping import Float, Float32, Int64
 from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.settings import sub_skills_of
 from services.cli.progress import Bar
-from services.reporting.choices import shares_in_words, usage
+from services.reporting.choices import describe_shares, statistics
 from services.reporting.drawing import Picture, colour_of, drawn, legend_of_markers, marker_of, panels
 from services.reporting.page import Part, Prose, Section
 from services.reporting.run_group import RunGroup, has_sub_skills, policies
@@ -96,7 +96,7 @@ def _draw(group: RunGroup, task: str, shots: int, perplexity: float, seed: int) 
     kept = thin_out(others, min(MOST_STATES, MOST_POINTS // (2 * len(runs))))
     perplexity = min(perplexity, max(1.0, (len(kept.states) - 1) / 3))
     places = embed(Normalisation.of(others)(kept.states), perplexity, seed)
-    shown = [
+    policy_panels = [
         _Panel(
             f"{label}, {adaptation} adaptation",
             sub_skills_of(run.config.method),
@@ -106,7 +106,8 @@ def _draw(group: RunGroup, task: str, shots: int, perplexity: float, seed: int) 
         for adaptation, policy in policies(run, support).items()
     ]
     rows, columns = (1, 2) if len(runs) == 1 else (2, len(runs))
-    in_order = shown if rows == 1 else [*shown[::2], *shown[1::2]]  # all before adaptation above all after it
+    # All before adaptation above all after it.
+    in_order = policy_panels if rows == 1 else [*policy_panels[::2], *policy_panels[1::2]]
     width, height = max(7.5, 2.5 * columns), 3.6 if rows == 1 else 6.0
     with panels(rows, columns, width=width, height=height) as (figure, axes):
         for axis, panel in zip(axes, in_order, strict=True):
@@ -114,15 +115,16 @@ def _draw(group: RunGroup, task: str, shots: int, perplexity: float, seed: int) 
                 x, y = places[panel.chosen == k].T
                 axis.plot(x, y, marker_of(k), color=colour_of(k), markersize=3, markeredgewidth=0, alpha=0.85)
             axis.set(title=panel.title, xticks=[], yticks=[], xlabel="t-SNE 1", ylabel="t-SNE 2")
-        most = max(panel.sub_skills for panel in shown)
+        most = max(panel.sub_skills for panel in policy_panels)
         legend_of_markers(figure, [f"sub-skill {k}" for k in range(most)])
-        return drawn(figure, f"t-SNE of {task}", _told(shown, kept, len(support), len(others), perplexity, seed))
+        description = _describe(policy_panels, kept, len(support), len(others), perplexity, seed)
+        return drawn(figure, f"t-SNE of {task}", description)
 
 
-def _told(shown: Sequence[_Panel], kept: Thinned, support: int, others: int, perplexity: float, seed: int) -> str:
+def _describe(panels: Sequence[_Panel], kept: Thinned, support: int, others: int, perplexity: float, seed: int) -> str:
     thinned = "all" if kept.every == 1 else f"one in {kept.every}"
     few = f", of which the paper draws {OTHERS}; no more are held out" if others < OTHERS else ""
-    use = "; ".join(f"{panel.title}: {_shares(panel)}" for panel in shown)
+    use = "; ".join(f"{panel.title}: {_shares(panel)}" for panel in panels)
     return (
         f"{len(kept.states)} states, {thinned} of those in {others} held-out demonstrations{few}; adapted to {support} "
         f"others; perplexity {perplexity:g}, seed {seed}. {use}."
@@ -130,5 +132,5 @@ def _told(shown: Sequence[_Panel], kept: Thinned, support: int, others: int, per
 
 
 def _shares(panel: _Panel) -> str:
-    shares = usage([panel.chosen], panel.sub_skills).shares
-    return f"{(shares >= IN_USE).sum()} of {panel.sub_skills} sub-skills in use, {shares_in_words(shares)}"
+    shares = statistics([panel.chosen], panel.sub_skills).shares
+    return f"{(shares >= IN_USE).sum()} of {panel.sub_skills} sub-skills in use, {describe_shares(shares)}"

@@ -53,9 +53,9 @@ def failures_of_run(finished: FinishedRun, *, videos: bool = False) -> Section:
     try:
         with replaying(finished) as replay:
             for of_task in worst:
-                found, own_rows = _of_task(replay, of_task, videos=videos)
-                parts += found
-                rows += own_rows
+                task_parts, task_rows = _of_task(replay, of_task, videos=videos)
+                parts += task_parts
+                rows += task_rows
     except ReplayError as error:
         return Section(title, [Prose(f"Their episodes cannot be run again here: {error}.")])
     head = ["task", "shots", "episode", "solved", "steps", "measure", "first step", "smallest", "largest", "last step"]
@@ -96,7 +96,7 @@ def _of_task(
     filmed = next(row for row in adaptations[0] if not row.success)
     replayed = _run_again(replay, adaptations, filmed if videos else None)
     measure = measure_of(run.experiment.suite, task)
-    parts: list[Part] = [Prose(_told(rows, replayed, measure))]
+    parts: list[Part] = [Prose(_describe_task(rows, replayed, measure))]
     if measure is not None and (measured := [one for one in replayed if _course(one, measure).size]):
         parts.append(draw_episodes(measured, measure, run.experiment.suite.best_score))
     if videos:
@@ -126,27 +126,27 @@ def _course(replayed: ReplayedEpisode, measure: Measure) -> Float64[np.ndarray, 
     return replayed.recording.infos.get(measure.name, np.zeros(0))
 
 
-def _told(rows: Sequence[EpisodeResult], replayed: Sequence[ReplayedEpisode], measure: Measure | None) -> str:
+def _describe_task(rows: Sequence[EpisodeResult], replayed: Sequence[ReplayedEpisode], measure: Measure | None) -> str:
     first = rows[0]
     solved = sum(row.success for row in rows)
-    told = f"{first.task} ({first.split}), {first.shots}-shot: {solved} of {len(rows)} episodes were solved"
+    text = f"{first.task} ({first.split}), {first.shots}-shot: {solved} of {len(rows)} episodes were solved"
     if len(replayed) < len(rows):
-        told += f"; {len(replayed)} of them were run again, the worst support sets first"
-    told += "."
+        text += f"; {len(replayed)} of them were run again, the worst support sets first"
+    text += "."
     if differences := [one.difference for one in replayed if one.difference is not None]:
-        told += f" {len(differences)} came out otherwise than in the run: {differences[0]}."
+        text += f" {len(differences)} came out otherwise than in the run: {differences[0]}."
     if measure is None:
-        told += " The suite does not measure how far an episode has come, only whether it is solved."
-    return told
+        text += " The suite does not measure how far an episode has come, only whether it is solved."
+    return text
 
 
 def _table_row(replayed: ReplayedEpisode, measure: Measure | None) -> list[str | int | float]:
     row, episode = replayed.row, replayed.rollout
     course = np.zeros(0) if measure is None else _course(replayed, measure)
     numbers = (course[0], course.min(), course.max(), course[-1]) if course.size else ()
-    told = [f"{number:.3g}" for number in numbers] or [""] * 4
+    fields = [f"{number:.3g}" for number in numbers] or [""] * 4
     what = "none" if measure is None else measure.words
-    return [row.task, row.shots, row.episode, "yes" if episode.success else "no", len(episode), what, *told]
+    return [row.task, row.shots, row.episode, "yes" if episode.success else "no", len(episode), what, *fields]
 
 
 def draw_episodes(replayed: Sequence[ReplayedEpisode], measure: Measure, best_score: int) -> Picture:
@@ -155,10 +155,10 @@ def draw_episodes(replayed: Sequence[ReplayedEpisode], measure: Measure, best_sc
     kinds = {success: [one for one in replayed if one.rollout.success is success] for success in (True, False)}
     with panels(width=7.5, height=3.1) as (figure, (axis,)):
         for success, style, word in ((True, SOLVED, "solved"), (False, FAILED, "failed")):
-            for place, one in enumerate(kinds[success]):
-                course = _course(one, measure) + scored * APART * place
+            for index, one in enumerate(kinds[success]):
+                course = _course(one, measure) + scored * APART * index
                 steps = np.arange(1, len(course) + 1)
-                label = f"{word} ({len(kinds[success])})" if place == 0 else None
+                label = f"{word} ({len(kinds[success])})" if index == 0 else None
                 drawing: dict[str, Any] = {"drawstyle": "steps-post"} if scored else {}
                 axis.plot(steps, course, label=label, markevery=[-1], linewidth=1.2, **style, **drawing)
         axis.set(xlabel="step", ylabel=measure.words, xlim=(0, None))
@@ -168,18 +168,18 @@ def draw_episodes(replayed: Sequence[ReplayedEpisode], measure: Measure, best_sc
             axis.set_ylim(bottom=0)
         axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
         title = f"{row.task}, {row.shots}-shot: {measure.words} at each step"
-        told = " ".join(
-            _in_words(word, kinds[success], measure) for success, word in ((False, "failed"), (True, "solved"))
+        text = " ".join(
+            _describe_episodes(word, kinds[success], measure) for success, word in ((False, "failed"), (True, "solved"))
         )
         apart = "; equal scores are drawn a little apart" if scored else ""
-        return drawn(figure, title, f"A line is an episode; a cross or a dot is its end{apart}. {told}")
+        return drawn(figure, title, f"A line is an episode; a cross or a dot is its end{apart}. {text}")
 
 
-def _in_words(word: str, replayed: Sequence[ReplayedEpisode], measure: Measure) -> str:
+def _describe_episodes(word: str, replayed: Sequence[ReplayedEpisode], measure: Measure) -> str:
     if not replayed:
         return f"None {word}."
     courses = [_course(one, measure) for one in replayed]
-    first, low, high, last = np.mean([(own[0], own.min(), own.max(), own[-1]) for own in courses], axis=0)
+    first, low, high, last = np.mean([(each[0], each.min(), each.max(), each[-1]) for each in courses], axis=0)
     return (
         f"{len(replayed)} {word}: on average {first:.3g} at the first step, {low:.3g} at the smallest, {high:.3g} at "
         f"the largest and {last:.3g} at the last."

@@ -107,7 +107,7 @@ def _panel(side: Side, time: int) -> UInt8[np.ndarray, "height width 3"]:
     panel.paste(Image.fromarray(camera), (BORDER, top + BORDER))
     for done in range(step):
         acted = side.acting(done + 1)
-        ends = [round(width * place / side.steps) for place in (done, done + 1)]
+        ends = [round(width * position / side.steps) for position in (done, done + 1)]
         shade = FAINT if acted is None else colour_of(acted)
         draw.rectangle((ends[0], height - STRIP + 2, max(ends[0], ends[1] - 1), height - 1), shade)
     if time >= len(side.frames) - 1:
@@ -164,7 +164,7 @@ def write_film(path: Path, sides: Sequence[Side]) -> None:
 def _write_gif(path: Path, pictures: Iterator[np.ndarray], rate: int) -> None:
     """Write all pictures in the colours of those at the beginning, in the middle and at the end."""
     images = [Image.fromarray(picture) for picture in pictures]
-    chosen = [np.asarray(images[place]) for place in (0, len(images) // 2, len(images) - 1)]
+    chosen = [np.asarray(images[index]) for index in (0, len(images) // 2, len(images) - 1)]
     palette = Image.fromarray(np.concatenate(chosen)).quantize(128, method=Image.Quantize.MEDIANCUT)
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     first.save(path, save_all=True, append_images=others, duration=1000 // rate, loop=0, optimize=True)

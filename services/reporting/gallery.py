@@ -97,6 +97,6 @@ def _at_work(suite: TaskSuite, camera: str | View, task: str, seed: int) -> UInt
         env.reset(seed=seed)
         for action in attempt.actions[: int(MOMENT * len(attempt.actions))]:
             env.step(action)
-    drawn = picture(env, camera, HEIGHT, WIDTH)
+    image = picture(env, camera, HEIGHT, WIDTH)
     env.close()
-    return drawn
+    return image

@@ -51,7 +51,7 @@ def _data_sets(finished: FinishedRun) -> DataTable:
     rows = [
         [
             *(task, ids.get(digest, "")),
-            *(found.get(task, "") for found in (summary.demonstrations, summary.failed_attempts)),
+            *(counts.get(task, "") for counts in (summary.demonstrations, summary.failed_attempts)),
             digest[:DIGITS],
         ]
         for task, digest in finished.checkpoint.manifest.data.items()

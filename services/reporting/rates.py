@@ -80,11 +80,11 @@ def rates_of_tasks(finished: FinishedRun) -> Section:
     return Section("Success of each task", [*parts, DataTable("Each task", head, rows)])
 
 
-def _bars(split: Split, found: Mapping[tuple[Split, int, str], Mean], what: str, best: int) -> Picture:
+def _bars(split: Split, by_task: Mapping[tuple[Split, int, str], Mean], what: str, best: int) -> Picture:
     """Draw a split's tasks, the best on top in all panels alike, one panel for each number of shots."""
     by_shots: dict[int, dict[str, Mean]] = defaultdict(dict)
-    for (own, shots, task), estimate in found.items():
-        if own == split:
+    for (of_split, shots, task), estimate in by_task.items():
+        if of_split == split:
             by_shots[shots][task] = estimate
     means = {task: sum(of[task].mean for of in by_shots.values()) for task in by_shots[min(by_shots)]}
     tasks = sorted(means, key=lambda task: (means[task], task))
@@ -93,13 +93,13 @@ def _bars(split: Split, found: Mapping[tuple[Split, int, str], Mean], what: str,
     height = rows * (0.9 + INCHES_A_TASK * len(tasks))
     with panels(rows, columns, width=3.2 + 2.3 * columns, height=height) as (figure, axes):
         for index, (axis, shots) in enumerate(zip(axes, sorted(by_shots), strict=False)):
-            own = [by_shots[shots][task] for task in tasks]
-            reach = list(zip(*(estimate.reach for estimate in own), strict=True))
-            axis.barh(range(len(tasks)), [e.mean for e in own], color=colour_of(0), alpha=0.75, height=0.7)
-            axis.errorbar([e.mean for e in own], range(len(tasks)), xerr=reach, fmt="none", ecolor=INK, capsize=2)
-            over_all = sum(estimate.mean for estimate in own) / len(own)
+            of_tasks = [by_shots[shots][task] for task in tasks]
+            reach = list(zip(*(estimate.reach for estimate in of_tasks), strict=True))
+            axis.barh(range(len(tasks)), [e.mean for e in of_tasks], color=colour_of(0), alpha=0.75, height=0.7)
+            axis.errorbar([e.mean for e in of_tasks], range(len(tasks)), xerr=reach, fmt="none", ecolor=INK, capsize=2)
+            over_all = sum(estimate.mean for estimate in of_tasks) / len(of_tasks)
             axis.axvline(over_all, linestyle="dashed", color=colour_of(3))
-            for place, estimate in enumerate(own):
+            for place, estimate in enumerate(of_tasks):
                 count = _count(estimate, best)
                 axis.text(1.02, place, count, transform=axis.get_yaxis_transform(), va="center", size=7.5)
             axis.set(title=f"{shots}-shot: {over_all:.2f} on average", xlabel=what, xlim=(0, best * 1.02))
@@ -108,16 +108,15 @@ def _bars(split: Split, found: Mapping[tuple[Split, int, str], Mean], what: str,
             axis.grid(visible=False, axis="y")
         for axis in axes[len(by_shots) :]:
             axis.remove()
-        return drawn(figure, f"{split}: {what} of each task", _in_words(by_shots, tasks, what))
+        return drawn(figure, f"{split}: {what} of each task", _describe(by_shots, tasks, what))
 
 
-def _in_words(by_shots: Mapping[int, Mapping[str, Mean]], tasks: Sequence[str], what: str) -> str:
-    told = []
+def _describe(by_shots: Mapping[int, Mapping[str, Mean]], tasks: Sequence[str], what: str) -> str:
+    texts = []
     for shots in sorted(by_shots):
-        own = by_shots[shots]
-        mean = sum(estimate.mean for estimate in own.values()) / len(own)
-        best, worst = tasks[-1], tasks[0]
-        ends = f", from {worst} with {own[worst].mean:.2f} to {best} with {own[best].mean:.2f}" if len(own) > 1 else ""
-        told.append(f"{shots}-shot {mean:.2f} on average (dashed){ends}")
+        rates = {task: estimate.mean for task, estimate in by_shots[shots].items()}
+        mean, worst, best = sum(rates.values()) / len(rates), tasks[0], tasks[-1]
+        ends = f", from {worst} with {rates[worst]:.2f} to {best} with {rates[best]:.2f}" if len(rates) > 1 else ""
+        texts.append(f"{shots}-shot {mean:.2f} on average (dashed){ends}")
     what_it_is = f"Bars are a task's {what}, whiskers its 95% interval; the order is that of the mean over all shots"
-    return f"{what_it_is}: {'; '.join(told)}."
+    return f"{what_it_is}: {'; '.join(texts)}."

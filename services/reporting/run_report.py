@@ -107,7 +107,7 @@ def write_run_page(
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
-    finished = FinishedRun.found(args.run, args.runs)
+    finished = FinishedRun.find(args.run, args.runs)
     path = args.output or finished.folder / "report" / PAGE
     if path.is_dir():
         raise UserError(f"--output: got {path}, a folder; wanted a file, as {path / PAGE}")

@@ -46,10 +46,10 @@ def _flag(name: str, value: Any) -> list[str]:
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    found = {}
+    flat = {}
     for name, value in settings.items():
-        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
-    return found
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat
 
 
 def settings_of_run(finished: FinishedRun) -> Section:
@@ -58,15 +58,15 @@ def settings_of_run(finished: FinishedRun) -> Section:
     size, preset, differing = nearest_preset(config)
     meanings = dict(_meanings(config))
     name = f"{size} of {config.method.name} on {config.suite.name}"
-    told = (
+    text = (
         f"The preset {name} is the nearest; {len(differing)} of {len(preset)} settings differ from it."
         if differing
         else f"All settings are those of the preset {name}."
     )
     others = {name: value for name, value in _flat(config.model_dump()).items() if name not in differing}
-    changed = [[n, _shown(v), _shown(preset.get(n)), meanings.get(n, "")] for n, v in differing.items()]
-    same = [[n, _shown(v), meanings.get(n, "")] for n, v in others.items()]
-    parts: list[Part] = [Prose(told)]
+    changed = [[n, _text(v), _text(preset.get(n)), meanings.get(n, "")] for n, v in differing.items()]
+    same = [[n, _text(v), meanings.get(n, "")] for n, v in others.items()]
+    parts: list[Part] = [Prose(text)]
     if changed:
         parts.append(DataTable("Settings that differ", ["setting", "here", f"in {size}", "what it is"], changed))
     return Section(
@@ -83,7 +83,7 @@ def _meanings(settings: BaseModel, prefix: str = "") -> Iterator[tuple[str, str]
             yield f"{prefix}{name}", " ".join(field.description.split())
 
 
-def _shown(value: Any) -> str:
+def _text(value: Any) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(map(str, value))
     return "none" if value is None else str(value)

@@ -57,7 +57,7 @@ def run(arguments: Sequence[str]) -> None:
     args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
     _check(args)
     torch.set_num_threads(1)
-    group = group_runs(_found(args.which, args.runs), args.tasks)
+    group = group_runs(_labelled_runs(args.which, args.runs), args.tasks)
     sections = sub_skill_sections(group, args.shots, args.rollouts)
     sections.append(embedding_section(group, args.embedding_shots, args.perplexity, args.seed))
     lead = [
@@ -80,36 +80,36 @@ def _check(args: Arguments) -> None:
             raise UserError(f"--{name.replace('_', '-')}: got {got}; wanted at least {bound}")
 
 
-def _found(which: Sequence[str], runs: Path) -> dict[str, FinishedRun]:
+def _labelled_runs(which: Sequence[str], runs: Path) -> dict[str, FinishedRun]:
     """Return the runs by their labels.
 
     Raises:
         UserError: for none at all, two of one label, or one that there is not.
     """
-    found: dict[str, FinishedRun] = {}
+    by_label: dict[str, FinishedRun] = {}
     for named in which:
         label, _, name = named.rpartition("=")
-        own = FinishedRun(find_folder(name, runs, MARK, "RUN"))
-        if (label := label or own.name) in found:
+        run = FinishedRun(find_folder(name, runs, MARK, "RUN"))
+        if (label := label or run.name) in by_label:
             raise UserError(f"RUN: got {label} twice; wanted each once, or labels to tell them apart: LABEL=RUN")
-        found[label] = own
-    if not any(map(has_sub_skills, found.values())):
-        got = ", ".join(f"{label} of {own.config.method.name}" for label, own in found.items()) or "none"
+        by_label[label] = run
+    if not any(map(has_sub_skills, by_label.values())):
+        got = ", ".join(f"{label} of {run.config.method.name}" for label, run in by_label.items()) or "none"
         raise UserError(f"RUN: got {got}; wanted at least one of a method with several sub-skills, as dmil")
-    return found
+    return by_label
 
 
 def _runs_table(group: RunGroup) -> DataTable:
     rows = []
-    for label, own in group.runs.items():
-        evaluation, checkpoint = own.config.evaluation, own.checkpoint
+    for label, run in group.runs.items():
+        evaluation, checkpoint = run.config.evaluation, run.checkpoint
         rows.append(
             [
                 label,
-                own.config.method.name,
-                getattr(own.config.method, "sub_skills", "none"),
-                own.config.suite.name,
-                own.config.seed,
+                run.config.method.name,
+                getattr(run.config.method, "sub_skills", "none"),
+                run.config.suite.name,
+                run.config.seed,
                 checkpoint.manifest.iteration,
                 evaluation.fine_tuning_steps,
                 f"{evaluation.learning_rate:g}",

@@ -46,7 +46,7 @@ class Arguments:
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, tyro.MISSING))
-    finished = FinishedRun.found(args.run, args.runs)
+    finished = FinishedRun.find(args.run, args.runs)
     row = _row_of(finished, args)
     path = args.output or finished.folder / "report" / "videos" / f"{name_of(row)}.{args.format}"
     if path.suffix != f".{args.format}":

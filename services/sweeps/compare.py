@@ -59,7 +59,7 @@ def _of_sweep(name: str, args: Arguments) -> Path:
 def _of_runs(args: Arguments) -> Path:
     if len(args.names) < 2:
         raise UserError(f"RUN: got {' '.join(args.names) or 'none'}; wanted two finished runs or more, or one sweep")
-    runs = [FinishedRun.found(name, args.runs) for name in args.names]
+    runs = [FinishedRun.find(name, args.runs) for name in args.names]
     comparison = compare_runs(runs, args.baseline)
     path = args.output or Path("comparison.html")
     path.parent.mkdir(parents=True, exist_ok=True)

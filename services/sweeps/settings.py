@@ -145,7 +145,7 @@ class Sweep(Settings):
         """
         budget = self.presets.get(preset, Budget())
         changes: dict[str, Any] = {
-            "variants": {name: _laid_over(own, budget.variants.get(name, {})) for name, own in self.variants.items()},
+            "variants": {name: _laid_over(of, budget.variants.get(name, {})) for name, of in self.variants.items()},
             "suites": tuple(suites) or budget.suites or self.suites,
             "seeds": tuple(seeds) or budget.seeds or self.seeds,
             "settings": _laid_over(self.settings, budget.settings),
@@ -161,7 +161,7 @@ class Sweep(Settings):
         variants = list(self.variants or (self.search.variants() if self.search else {}))
         if self.evaluations is None:
             return variants
-        return [row_name(variants, variant, own) for variant in variants for own in self.evaluations]
+        return [row_name(variants, variant, evaluation) for variant in variants for evaluation in self.evaluations]
 
 
 def _laid_over(settings: Overrides, others: Overrides) -> Overrides:
@@ -199,10 +199,10 @@ def planned(sweep: Sweep, preset: Preset) -> list[PlannedTrial]:
     evaluation: Overrides = {"shots": list(sweep.shots)} | ({} if preset == "smoke" else {"episodes": sweep.episodes})
     layers = {"shots, episodes": {"evaluation": evaluation}, "settings": sweep.settings}
     trials = []
-    for suite, (variant, own), seed in itertools.product(sweep.suites, variants.items(), sweep.seeds):
-        method = method_named(own if "name" in own.get("method", {}) else sweep.settings)
+    for suite, (variant, of_variant), seed in itertools.product(sweep.suites, variants.items(), sweep.seeds):
+        method = method_named(of_variant if "name" in of_variant.get("method", {}) else sweep.settings)
         settings = preset_of(suite, preset, method).model_dump()
-        for origin, overrides in {**layers, f"variants.{variant}": own, "seeds": {"seed": seed}}.items():
+        for origin, overrides in {**layers, f"variants.{variant}": of_variant, "seeds": {"seed": seed}}.items():
             settings = merged(settings, overrides, origin)
         config = checked(settings, f"{variant} on {suite}: ")
         evaluations = {

@@ -37,34 +37,34 @@ def _in_use(cell: Cell) -> str:
 
 def _grid(tables: Tables) -> dict[str, dict[str, Cell]]:
     grid: dict[str, dict[str, Cell]] = {row: {} for row in tables.rows}
-    for found in tables.cells:
-        grid[found.suite if tables.by == "suites" else found.row][column_of(found, tables.by)] = found
+    for cell in tables.cells:
+        grid[cell.suite if tables.by == "suites" else cell.row][column_of(cell, tables.by)] = cell
     return grid
 
 
-def _figures(found: Cell | None, digits: int) -> list[str]:
+def _mean_and_paper(cell: Cell | None, digits: int) -> list[str]:
     """Return a cell's mean and the paper's, a line each: none if it was not run."""
-    if found is None:
+    if cell is None:
         return []
-    interval = interval_text(found.low, found.high, digits)
-    lines = [f"{found.mean:.{digits}f}" + (f" ({interval})" if interval else "")]
-    if found.paper is not None:
-        mark = " outside" if found.outside else ""
-        lines.append(f"paper {found.paper.text(digits)}: {found.difference:+.{digits}f}{mark}")
+    interval = interval_text(cell.low, cell.high, digits)
+    lines = [f"{cell.mean:.{digits}f}" + (f" ({interval})" if interval else "")]
+    if cell.paper is not None:
+        mark = " outside" if cell.outside else ""
+        lines.append(f"paper {cell.paper.text(digits)}: {cell.difference:+.{digits}f}{mark}")
     return lines
 
 
-def _lines(found: Cell | None, digits: int) -> list[str]:
+def _lines(cell: Cell | None, digits: int) -> list[str]:
     """Return a cell's figures, and what they come from."""
-    if found is None:
+    if cell is None:
         return []
-    lines = _figures(found, digits)
-    if found.environment_steps:
-        lines.append(f"{found.environment_steps:,} environment steps")
-    if in_use := _in_use(found):
+    lines = _mean_and_paper(cell, digits)
+    if cell.environment_steps:
+        lines.append(f"{cell.environment_steps:,} environment steps")
+    if in_use := _in_use(cell):
         lines.append(f"{in_use} sub-skills in use")
-    plural = "seed" if len(found.seeds) == 1 else "seeds"
-    return [*lines, f"{len(found.seeds)} {plural}, {found.episodes} episodes"]
+    plural = "seed" if len(cell.seeds) == 1 else "seeds"
+    return [*lines, f"{len(cell.seeds)} {plural}, {cell.episodes} episodes"]
 
 
 def _head(tables: Tables) -> str:
@@ -88,11 +88,11 @@ def show(tables: Tables, sweep: SweepFolder) -> None:
         console.print(view)
     if tables.differences:
         view = Table(*DIFFERENCE)
-        for found in tables.differences:
-            view.add_row(*_difference_fields(found, digits))
+        for pair in tables.differences:
+            view.add_row(*_difference_fields(pair, digits))
         console.print(view)
-    for found in tables.unpaired:
-        console.print(_not_compared(found), markup=False)
+    for pair in tables.unpaired:
+        console.print(_not_compared(pair), markup=False)
     for name, error in tables.failed.items():
         console.print(f"failed: {name}: {error}", markup=False)
     console.print(f"tables: {sweep.path / 'tables'}")
@@ -112,14 +112,14 @@ def _sample_fields(sample: Sample) -> list[str]:
     return [sample.sample, sample.suite, str(sample.seed), sample.status, str(sample.iteration), held_out, settings]
 
 
-def _difference_fields(found: Difference, digits: int) -> list[str]:
-    interval = interval_text(found.low, found.high, digits, "+")
-    fields = [found.row, found.baseline, _where(found), f"{found.mean:+.{digits}f}", interval]
-    return [*fields, str(found.pairs), str(len(found.seeds)), found.differs]
+def _difference_fields(pair: Difference, digits: int) -> list[str]:
+    interval = interval_text(pair.low, pair.high, digits, "+")
+    fields = [pair.row, pair.baseline, _where(pair), f"{pair.mean:+.{digits}f}", interval]
+    return [*fields, str(pair.pairs), str(len(pair.seeds)), pair.differs]
 
 
-def _not_compared(found: Unpaired) -> str:
-    return f"Not compared: {found.row} with {found.baseline} ({_where(found)}): {found.why}"
+def _not_compared(pair: Unpaired) -> str:
+    return f"Not compared: {pair.row} with {pair.baseline} ({_where(pair)}): {pair.why}"
 
 
 def write_tables(sweep: SweepFolder) -> Tables:
@@ -130,8 +130,8 @@ def write_tables(sweep: SweepFolder) -> Tables:
     folder.mkdir(exist_ok=True)
     write_file(folder / "tables.json", tables.model_dump_json(indent=1) + "\n")
     write_file(folder / "table.md", _markdown(tables))
-    write_file(folder / "cells.csv", _csv([_flat(found) for found in tables.cells]))
-    write_file(folder / "differences.csv", _csv([found.model_dump() for found in tables.differences]))
+    write_file(folder / "cells.csv", _csv([_flat(of) for of in tables.cells]))
+    write_file(folder / "differences.csv", _csv([of.model_dump() for of in tables.differences]))
     write_file(folder / "table.tex", _latex(tables))
     if tables.samples:
         best = yaml.safe_dump(tables.samples[0].settings, sort_keys=False)
@@ -142,8 +142,8 @@ def write_tables(sweep: SweepFolder) -> Tables:
     return tables
 
 
-def _flat(found: Cell) -> dict[str, object]:
-    row = found.model_dump()
+def _flat(cell: Cell) -> dict[str, object]:
+    row = cell.model_dump()
     paper = row.pop("paper")
     row["paper"], row["paper_spread"] = (paper["value"], paper["spread"]) if paper else (None, None)
     return row
@@ -176,8 +176,8 @@ def _markdown(tables: Tables) -> str:
         lines += markdown_rows(["row", "where", "interquartile mean", "sub-skills in use", "interval"], rows)
     if tables.differences:
         lines += ["", "On the same seeds and episodes:", ""]
-        lines += markdown_rows(DIFFERENCE, (_difference_fields(found, digits) for found in tables.differences))
-    lines += [f"\n{_not_compared(found)}" for found in tables.unpaired]
+        lines += markdown_rows(DIFFERENCE, (_difference_fields(pair, digits) for pair in tables.differences))
+    lines += [f"\n{_not_compared(pair)}" for pair in tables.unpaired]
     lines += [f"\nFailed: {name}: {' '.join(error.split())}" for name, error in tables.failed.items()]
     return "\n".join(lines) + "\n"
 
@@ -198,22 +198,22 @@ def _latex(tables: Tables) -> str:
     head = [stacked(column.split(", ")) for column in tables.columns]
     lines += [" & ".join(["", *head]) + r" \\", r"\midrule"]
     for row in tables.rows:
-        own = [stacked(_figures(grid[row].get(column), digits)) for column in tables.columns]
-        lines.append(" & ".join([row.translate(_TEX), *own]) + r" \\")
+        fields = [stacked(_mean_and_paper(grid[row].get(column), digits)) for column in tables.columns]
+        lines.append(" & ".join([row.translate(_TEX), *fields]) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
 def publish(tracker: Tracker, tables: Tables, sweep: SweepFolder) -> None:
     """Record the table, its plot and its means on the sweep's MLflow run."""
-    tracker.metrics(0, {_metric_name(found): found.mean for found in tables.cells}, anew=True)
+    tracker.metrics(0, {_metric_name(cell): cell.mean for cell in tables.cells}, anew=True)
     tracker.tags({"mlflow.note.content": _markdown(tables)})
     tracker.artifact(sweep.path / "tables", "tables")
     tracker.artifact(sweep.path / MARK)
 
 
-def _metric_name(found: Cell) -> str:
+def _metric_name(cell: Cell) -> str:
     """Return a name of characters that MLflow takes."""
-    name = f"{found.row}/{found.suite}/{found.split}/{found.shots}-shot"
+    name = f"{cell.row}/{cell.suite}/{cell.split}/{cell.shots}-shot"
     return "".join(c if c.isascii() and (c.isalnum() or c in "/_-. ") else "_" for c in name)
 
 

@@ -93,10 +93,10 @@ def run_trial(folder: Path, name: str, demonstrations: Path, environment: Mappin
             status = "FINISHED"
         except Exception as error:  # noqa: BLE001  whatever it is, it is shown, and the other trials go on
             status = "FAILED"
-            told = str(error) if isinstance(error, UserError | RunError) else f"{type(error).__name__}: {error}"
-            logger.error(told)
-            tracker.tags({"error": told[:5000]})
-            sweep.finish(name, TrialResult(status="failed", error=told))
+            message = str(error) if isinstance(error, UserError | RunError) else f"{type(error).__name__}: {error}"
+            logger.error(message)
+            tracker.tags({"error": message[:5000]})
+            sweep.finish(name, TrialResult(status="failed", error=message))
         finally:
             tracker.close(status)
 
@@ -131,11 +131,11 @@ def _run(sweep: SweepFolder, trial: PlannedTrial, store: DemoStore, tracker: Tra
             tasks = [task for split, task in experiment.tasks if split in sweep.record.sweep.splits]
             folders = {}
             for row, evaluation in trial.evaluations.items():
-                own = Experiment(with_evaluation(config, evaluation), store)
+                evaluated_experiment = Experiment(with_evaluation(config, evaluation), store)
                 folders[row] = evaluated(home, evaluation, tasks)
                 if not (folders[row] / "episodes.jsonl").exists():
                     folders[row].mkdir(parents=True, exist_ok=True)
-                    own.evaluate(runner, data, checkpoint, folders[row], tasks)
+                    evaluated_experiment.evaluate(runner, data, checkpoint, folders[row], tasks)
             clock.lap("evaluate")
     finally:
         runner.close()

@@ -81,11 +81,11 @@ class Progress(Callback):
         name = trial.config["trial"]
         self._at.pop(name, None)
         result = self._sweep.result(name)
-        told = "stopped early, for others are better" if result is None else result.error or result.status
+        message = "stopped early, for others are better" if result is None else result.error or result.status
         if result is not None and result.status == "failed":
-            logger.error(f"{name}: {told}")
+            logger.error(f"{name}: {message}")
         else:
-            logger.info(f"{name}: {told}")
+            logger.info(f"{name}: {message}")
         self._bar.advance(1, self._running())
 
     def _running(self) -> str:

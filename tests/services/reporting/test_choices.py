@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.reporting.choices import Segment, segments, usage
+from services.reporting.choices import Segment, segments, statistics
 
 
 def timeline(*sub_skills: int) -> np.ndarray:
@@ -17,7 +17,7 @@ TIMELINES = st.lists(st.lists(st.integers(0, 3), max_size=12), min_size=1, max_s
 
 
 def test_a_case_by_hand():
-    use = usage([timeline(0, 0, 1, 1, 1, 0), timeline(1, 2)], 4)
+    use = statistics([timeline(0, 0, 1, 1, 1, 0), timeline(1, 2)], 4)
     assert (use.episodes, use.steps) == (2, 8)
     np.testing.assert_allclose(use.shares, [3 / 8, 4 / 8, 1 / 8, 0])
     np.testing.assert_allclose(use.dwell, [3 / 2, 4 / 2, 1, np.nan])
@@ -34,24 +34,24 @@ def test_stretches_by_hand():
 
 
 def test_a_collapse_has_one_share_and_no_switch():
-    use = usage([timeline(*[1] * 30)] * 3, 3)
+    use = statistics([timeline(*[1] * 30)] * 3, 3)
     assert use.shares.tolist() == [0, 1, 0]
     assert use.switches == 0
     assert use.dwell[1] == 30
 
 
 def test_an_episode_does_not_go_over_into_the_next():
-    assert usage([timeline(0), timeline(1)], 2).transitions.sum() == 0
+    assert statistics([timeline(0), timeline(1)], 2).transitions.sum() == 0
 
 
 def test_nothing_at_all_has_no_share_of_anything():
-    use = usage([], 2)
+    use = statistics([], 2)
     assert (use.episodes, use.steps, use.switches, use.shares.tolist()) == (0, 0, 0.0, [0.0, 0.0])
 
 
 @given(TIMELINES)
 def test_it_agrees_with_counting_step_by_step(episodes: list[list[int]]):
-    use = usage([timeline(*episode) for episode in episodes], 4)
+    use = statistics([timeline(*episode) for episode in episodes], 4)
     every = [k for episode in episodes for k in episode]
     pairs = [pair for episode in episodes for pair in pairwise(episode)]
     for k in range(4):

@@ -44,7 +44,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def compared(*names: str, baseline: str | None = None):
-    return compare_runs([FinishedRun.found(name, Path("runs")) for name in names], baseline)
+    return compare_runs([FinishedRun.find(name, Path("runs")) for name in names], baseline)
 
 
 ALL = [f"{method}-seed-{seed}" for method in METHODS for seed in (0, 1)]
