@@ -3,7 +3,7 @@
 usage: neighbour.py FOLDER PROCESS...; as root, for it becomes the user nobody.
 """
 
-import email.parser  # noqa: F401  nobody may not import from root's Python what is imported late
+import email.parser  # noqa: F401  what is imported late must be there before: root's Python is closed to nobody
 import encodings.idna  # noqa: F401
 import http.client
 import json
@@ -31,6 +31,7 @@ REQUESTS = {
     ],
 }  # fmt: skip
 REFUSED = {400, 401, 403, 404, 405}
+FIGURES = b"# HELP"
 CALLS = [
     "NodeInfoGcsService/GetAllNodeInfo", "InternalKVGcsService/InternalKVKeys", "NodeManagerService/GetNodeStats",
     "NodeManagerService/RequestWorkerLease", "ObjectManagerService/Push", "ObjectManagerService/Pull",
@@ -52,6 +53,7 @@ def main() -> None:
     sockets = sorted({link.laddr for link in links if link.family == socket.AF_UNIX and link.laddr})
     paths = [root, *root.rglob("*"), *Path("/dev/shm").iterdir()]
     paths += [Path(f"/proc/{process.pid}/environ") for process in processes]
+    grpc.insecure_channel("127.0.0.1:1").close()  # it imports too
     os.setgroups([])
     os.setgid(NOBODY)
     os.setuid(NOBODY)
@@ -97,13 +99,16 @@ def _port(port: int) -> Iterator[str]:
         asked = http.client.HTTPConnection("127.0.0.1", port, timeout=SECONDS)
         try:
             asked.request(method, path, "{}" if method == "POST" else None, {"Content-Type": "application/json"})
-            status = asked.getresponse().status
+            answer = asked.getresponse()
+            text = answer.read(len(FIGURES))
         except (OSError, http.client.HTTPException):
             break  # no HTTP/1 here
         finally:
             asked.close()
-        if status not in REFUSED:
-            yield f"{method} {path}: {status}"
+        if text == FIGURES:
+            yield "Prometheus's figures"
+        elif answer.status not in REFUSED:
+            yield f"{method} {path}: {answer.status}"
     else:
         return
     with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
