@@ -1,6 +1,7 @@
 """What the tests of the service share: one small store of demonstrations, one Ray cluster, and the programs."""
 
 import functools
+import json
 import os
 import shutil
 import signal
@@ -120,6 +121,31 @@ def answers(url: str) -> bool:
 @pytest.fixture(scope="session", name="answers")
 def answers_fixture() -> Callable[[str], bool]:
     return answers
+
+
+class Doors(NamedTuple):
+    """What another user of the machine tried, and what let it in."""
+
+    ports: int
+    sockets: int
+    paths: int
+    doors: list[str]
+
+
+@pytest.fixture
+def doors() -> Callable[..., Doors | None]:
+    """Goes round folders and processes, given by their numbers, with what these started, as another user would.
+
+    Only root can become another user: for others it finds nothing.
+    """
+
+    def doors(*targets: Path | int) -> Doors | None:
+        if os.geteuid() != 0:
+            return None
+        command = [sys.executable, str(Path(__file__).with_name("neighbour.py")), *map(str, targets)]
+        return Doors(**json.loads(subprocess.check_output(command)))
+
+    return doors
 
 
 class Cluster(NamedTuple):

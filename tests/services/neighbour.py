@@ -1,6 +1,6 @@
 """Goes round some processes as another user of the machine would, and prints as JSON what let it in.
 
-usage: neighbour.py FOLDER PROCESS...; as root, for it becomes the user nobody.
+usage: neighbour.py FOLDER... PROCESS...; as root, for it becomes the user nobody.
 """
 
 import email.parser  # noqa: F401  what is imported late must be there before: root's Python is closed to nobody
@@ -46,13 +46,16 @@ SECONDS = 5.0
 
 def main() -> None:
     """Look as root at what there is, become nobody, and try it all."""
-    root, parents = Path(sys.argv[1]), [psutil.Process(int(number)) for number in sys.argv[2:]]
+    parents = [psutil.Process(int(given)) for given in sys.argv[1:] if given.isdigit()]
+    folders = [Path(given) for given in sys.argv[1:] if not given.isdigit()]
     processes = [*parents, *(child for parent in parents for child in parent.children(recursive=True))]
     links = [link for process in processes for link in _links(process)]
     ports = sorted({link.laddr.port for link in links if link.status == psutil.CONN_LISTEN})
     sockets = sorted({link.laddr for link in links if link.family == socket.AF_UNIX and link.laddr})
-    paths = [root, *root.rglob("*"), *Path("/dev/shm").iterdir()]
-    paths += [Path(f"/proc/{process.pid}/environ") for process in processes]
+    paths = [path for folder in folders for path in (folder, *folder.rglob("*"))]
+    for process in processes:
+        paths.append(Path(f"/proc/{process.pid}/environ"))
+        paths += [Path(file.path) for file in process.open_files() if file.path.startswith("/dev/shm")]
     grpc.insecure_channel("127.0.0.1:1").close()  # it imports too
     os.setgroups([])
     os.setgid(NOBODY)

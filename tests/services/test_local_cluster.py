@@ -16,6 +16,14 @@ import pytest
 
 from services import local_cluster
 
+JOB = """import os, pathlib
+from services.tracking.client import connect
+print('to', os.environ['MLFLOW_TRACKING_URI'], os.getcwd())
+pathlib.Path('artifact').write_text('x' * 3000)
+client = connect(os.environ['MLFLOW_TRACKING_URI'])
+run = client.create_run(client.create_experiment('x')).info
+client.log_artifact(run.run_id, 'artifact')
+print(client.list_artifacts(run.run_id)[0].file_size, 'bytes below', run.artifact_uri)"""
 SUBMIT = [sys.executable, "-m", "ray.scripts.scripts", "job", "submit"]
 
 
@@ -33,9 +41,12 @@ def own_token(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def started(programs, own_token: None, ports: list[str], workplace: Path) -> Iterator[tuple[Path, str]]:
+def started(
+    programs, own_token: None, ports: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[Path, str]]:
     """A cluster of its own, and what it said when it was started."""
     before = set(Path("/dev/shm").iterdir())
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")  # where nobody listens
     code, printed = programs("local_cluster", "start", *ports)
     assert code == 0, printed
     yield workplace / "cluster", printed
@@ -57,26 +68,34 @@ def ended(processes: list[psutil.Process]) -> bool:
 
 @pytest.mark.thorough
 @pytest.mark.alone
-def test_a_cluster_takes_jobs_with_its_token_and_leaves_nothing_behind(started, programs, answers, wait_for):
+def test_a_cluster_takes_jobs_with_its_token_and_leaves_nothing_behind(started, programs, answers, doors):
     folder, printed = started
     dashboard, mlflow = re.findall(r"^(?:Ray dashboard|MLflow): +(\S+)", printed, re.MULTILINE)
     assert answers(dashboard)
     assert answers(f"{mlflow}/health")
-    assert (folder / "token").stat().st_mode & 0o777 == 0o600
+    assert [path.stat().st_mode & 0o777 for path in (folder, folder / "token")] == [0o700, 0o600]
     connections = [connection for process in processes_of(folder) for connection in process.net_connections("tcp")]
     listening = {connection.laddr[0] for connection in connections if connection.status == psutil.CONN_LISTEN}
     assert listening
     assert all(ipaddress.ip_address(address.removeprefix("::ffff:")).is_loopback for address in listening)
+    record = json.loads((folder / "cluster.json").read_text())
+    found = doors(folder, Path(record["temporary"]), *(process["pid"] for process in record["processes"]))
+    if found is not None:
+        assert found.doors == ["GET /: 200", "Prometheus's figures"]  # the dashboard's empty page, Ray's metrics
+        assert min(found.ports, found.sockets) > 5
+        assert found.paths > 50
 
     command = next(line for line in printed.splitlines() if "job submit" in line).partition(" -- ")[0]
-    job = f"{sys.executable} -c \"import os; print('to', os.environ['MLFLOW_TRACKING_URI'], os.getcwd())\""
+    job = f'{sys.executable} -c "{JOB}"'
     submitted = subprocess.run(f"{command} -- {job}", shell=True, capture_output=True, text=True)
     assert submitted.returncode == 0, submitted.stdout + submitted.stderr
     assert f"to {mlflow} {folder.parent}" in submitted.stdout
+    assert "3000 bytes below mlflow-artifacts:/" in submitted.stdout
+    assert len(list((folder.parent / "mlartifacts").rglob("artifact"))) == 1
     for environment, complaint in (({}, "Missing"), ({"RAY_AUTH_TOKEN": "0" * 64}, "Invalid")):
         refused = subprocess.run(
             [*SUBMIT, "--address", dashboard, "--", "true"], capture_output=True, text=True,
-            env={**os.environ, "RAY_AUTH_MODE": "token" if environment else "disabled", **environment},
+            env={**os.environ, "no_proxy": "*", "RAY_AUTH_MODE": "token" if environment else "disabled", **environment},
         )  # fmt: skip
         assert refused.returncode == 1
         assert complaint in refused.stdout + refused.stderr
@@ -86,7 +105,6 @@ def test_a_cluster_takes_jobs_with_its_token_and_leaves_nothing_behind(started, 
     assert f"got a cluster that runs, Ray at {dashboard} and MLflow at {mlflow}" in said
 
     there = processes_of(folder)
-    record = json.loads((folder / "cluster.json").read_text())
     code, said = programs("local_cluster", "stop")
     assert (code, said) == (0, f"stopped: {len(there)} processes\n")
     assert ended(there)
@@ -140,3 +158,69 @@ def test_want_of_room_a_stale_token_and_a_damaged_note_are_told(
     code, said = programs("local_cluster", "start", *ports)
     assert code == 2
     assert "cluster.json: got processes" in said
+
+
+@pytest.mark.parametrize("fault", ["mode", "mark", "name", "link", ""])
+def test_a_note_removes_no_folder_but_the_one_that_was_made_for_it(tmp_path: Path, monkeypatch, capsys, fault: str):
+    monkeypatch.chdir(tmp_path)
+    folder, thesis = tmp_path / "cluster", tmp_path / "thesis"
+    folder.mkdir()
+    thesis.mkdir(mode=0o755 if fault == "mode" else 0o700)
+    (thesis / "text").write_text("chapter 1")
+    if fault != "mark":
+        (thesis / local_cluster.MARK).write_bytes(os.fsencode(tmp_path / "other" if fault == "name" else folder))
+    named = thesis
+    if fault == "link":
+        named = tmp_path / "link"
+        named.symlink_to(thesis)
+    record = local_cluster.Record(processes=[], temporary=named, dashboard="", mlflow="")
+    (folder / "cluster.json").write_text(record.model_dump_json())
+    local_cluster.run(["stop"])
+    said = capsys.readouterr().out
+    assert (thesis / "text").exists() == bool(fault)
+    assert (f"temporary: got {named}, which was not made for this cluster" in said) == bool(fault)
+    assert not (folder / "cluster.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("mode", "token_mode", "told"),
+    [
+        (0o777, 0o600, "cluster: got mode 0777"),
+        (0o720, 0o600, "cluster: got mode 0720"),
+        (0o700, 0o604, "token: got mode 0604"),
+        (0o755, 0o600, None),
+    ],
+)
+def test_a_token_that_others_could_know_is_not_used(
+    complaint, own_token: None, tmp_path: Path, monkeypatch, mode: int, token_mode: int, told: str | None
+):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "cluster"
+    folder.mkdir()
+    (folder / "token").write_text("known")
+    (folder / "token").chmod(token_mode)
+    folder.chmod(mode)
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        said = complaint(local_cluster.run, "start", "--ray-port", str(other.getsockname()[1]))
+    assert "--ray-port: got" in said
+    assert ("open to other users; it is closed, and a new token made" in said) == (told is not None)
+    assert told is None or told in said
+    token = folder / "token"
+    assert (token.read_text() == "known") == (told is None)
+    assert token.stat().st_mode & 0o777 == 0o600
+    assert not folder.stat().st_mode & 0o022
+
+
+def test_an_empty_token_is_made_anew_and_a_link_is_refused(complaint, own_token: None, tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    token = tmp_path / "cluster" / "token"
+    token.parent.mkdir(mode=0o700)
+    token.touch(mode=0o600)
+    complaint(local_cluster.run, "start", "--object-store-megabytes", "100000000")
+    assert re.fullmatch("[0-9a-f]{64}", token.read_text())
+    other = token.rename(tmp_path / "other")
+    token.symlink_to(other)
+    said = complaint(local_cluster.run, "start", "--object-store-megabytes", "100000000")
+    assert "token: got a link, or another user's; wanted your own" in said

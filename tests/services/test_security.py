@@ -79,11 +79,15 @@ def test_a_cluster_as_the_readme_starts_it_listens_on_loopback(cluster):
 
 
 FAILS = """
-import sys
+import os, shutil, sys, time
+from pathlib import Path
 from services import meta_train
 from services.cli.arguments import exit_code
 from services.experiments.experiment import Experiment
 def fail(*arguments):
+    while not Path("looked").exists():
+        time.sleep(0.1)
+    shutil.copytree(os.environ["RAY_TMPDIR"], "of-ray", symlinks=True, ignore=shutil.ignore_patterns("sockets"))
     raise ZeroDivisionError("made to fail")
 Experiment.evaluate = fail
 sys.exit(exit_code(meta_train.run, sys.argv[1:]))
@@ -91,26 +95,29 @@ sys.exit(exit_code(meta_train.run, sys.argv[1:]))
 
 
 @pytest.mark.thorough
-def test_a_run_on_ray_listens_on_loopback_and_keeps_its_secrets_when_it_fails(
-    workplace: Path, short_folder: Path, free_port, wait_for, monkeypatch
+def test_a_run_on_ray_lets_nobody_in_and_keeps_its_secrets_when_it_fails(
+    workplace: Path, short_folder: Path, free_port, wait_for, doors, monkeypatch
 ):
     planted = {name: secrets.token_hex(32) for name in ("user", "password", "token")}
     for name in SECURED_BY:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("RAY_TMPDIR", str(short_folder))
+    monkeypatch.setenv("RAY_ADDRESS", "")
+    monkeypatch.setenv("HOME", str(workplace))
     monkeypatch.setenv("RAY_AUTH_TOKEN", planted["token"])
     address = f"http://{planted['user']}:{planted['password']}@127.0.0.1:{free_port()}"
     monkeypatch.setenv("MLFLOW_TRACKING_URI", address)
     monkeypatch.setenv("PYTHONPATH", str(PROJECT))
     arguments = ["--preset", "ml10-smoke", "--name", "run", "--training.checkpoint-every", "5"]
-    arguments += ["--training.iterations", "200"]
+    arguments += ["--training.iterations", "10"]
     with (workplace / "printed").open("w") as output:
         program = subprocess.Popen(
             [sys.executable, "-c", FAILS, *arguments], stdout=output, stderr=subprocess.STDOUT, start_new_session=True
         )
     checkpoints = Checkpoints(workplace / "runs" / "run" / "checkpoints", 3)
     wait_for(lambda: bool(checkpoints.all()) or program.poll() is not None, "the first checkpoint")
-    found = listening(program.pid)
+    found, let_in = listening(program.pid), doors(*short_folder.iterdir(), program.pid)
+    (workplace / "looked").touch()
     program.wait()
     printed = (workplace / "printed").read_text()
     assert found, printed
@@ -121,9 +128,15 @@ def test_a_run_on_ray_listens_on_loopback_and_keeps_its_secrets_when_it_fails(
     assert "ZeroDivisionError: made to fail" in printed
     assert "MLflow at http://...@127.0.0.1" in printed
     assert "python -m services.tracking flush runs/run" in printed
-    assert any("gcs_server" in path.name for path in short_folder.rglob("*.out")), "Ray's logs are elsewhere"
+    if let_in is not None:
+        assert let_in.doors == []
+        assert min(let_in.ports, let_in.paths) > 5
+        assert let_in.sockets > 1
+    assert list(short_folder.iterdir()) == [], "what Ray made is gone"
+    assert not (workplace / ".ray").exists()
+    assert any("gcs_server" in path.name for path in (workplace / "of-ray").rglob("*.out")), "Ray's logs are elsewhere"
     for name, secret in planted.items():
-        assert holding(secret, workplace, short_folder) == [], name
+        assert holding(secret, workplace) == [], name
 
 
 @pytest.mark.thorough

@@ -1,0 +1,61 @@
+"""Which cluster a program works in, and what it says of one that it cannot join."""
+
+import os
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+
+from dmil_core.errors import UserError
+from services.distributed import cluster
+from services.distributed.cluster import joined, named_address
+
+
+@pytest.fixture
+def web_server() -> Iterator[int]:
+    """The port of a server that is no Ray."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield server.server_address[1]
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.fixture
+def named(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
+    """What a program does to its environment is undone."""
+    before = dict(os.environ)
+    yield monkeypatch
+    os.environ.clear()
+    os.environ.update(before)
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:{free}", "ray://127.0.0.1:{free}", "127.0.0.1:{web}", "no-such-host:1"])
+def test_an_address_where_no_ray_answers_is_named_soon(named, free_port, web_server: int, address: str):
+    address = address.format(free=free_port(), web=web_server)
+    named.setattr(cluster, "SECONDS_TO_ANSWER", 0.5)
+    named.setenv("RAY_ADDRESS", address)
+    with (
+        pytest.raises(UserError, match=f"^RAY_ADDRESS: got {address}, where no Ray answers; wanted HOST:PORT"),
+        joined(),
+    ):
+        pass
+
+
+def test_the_address_of_a_dashboard_is_told_without_its_secrets(named):
+    named.setenv("RAY_ADDRESS", "http://me:SECRET@127.0.0.1:8265")
+    with (
+        pytest.raises(UserError, match=r"^RAY_ADDRESS: got http://...@127.0.0.1:8265, perhaps of a dashboard"),
+        joined(),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("address", "name"), [(None, None), ("", None), ("local", None), ("auto", "auto"), ("head:6379", "head:6379")]
+)
+def test_an_empty_address_names_no_cluster(named, address: str | None, name: str | None):
+    if address is not None:
+        named.setenv("RAY_ADDRESS", address)
+    assert named_address() == name
