@@ -106,10 +106,13 @@ def test_ports_are_published_on_loopback_only_and_somebody_listens():
 
 
 def test_mlflow_answers_to_the_names_that_it_is_called_by():
-    command = services()["mlflow"]["command"]
-    allowed = set(command[command.index("--allowed-hosts") + 1].split(","))
+    allowed = set(services()["mlflow"]["environment"]["MLFLOW_SERVER_ALLOWED_HOSTS"].split(","))
     called = services()["head"]["environment"]["MLFLOW_TRACKING_URI"].removeprefix("http://")
     assert {called, "127.0.0.1:5000", "localhost:5000"} == allowed
+
+
+def test_mlflow_has_no_assistant():
+    assert "--gunicorn-opts" in services()["mlflow"]["command"]
 
 
 def test_the_head_asks_for_a_token():

@@ -118,7 +118,7 @@ def test_a_job_on_two_raylets_becomes_a_finished_run_of_mlflow_on_postgres(
     network.start(
         "mlflow", sys.executable, "-m", "mlflow", "server", "--backend-store-uri", postgres,
         "--artifacts-destination", str(workplace / "artifacts"), "--host", "127.0.0.1", "--port", "5000",
-        "--workers", "1",
+        "--workers", "1", "--gunicorn-opts", "--threads 8 --timeout 60 --no-control-socket",
     )  # fmt: skip
     ray = (sys.executable, "-m", "ray.scripts.scripts")
     temporary = tempfile.mkdtemp(prefix="dmil")
