@@ -75,6 +75,7 @@ def _join(address: str) -> None:
     """
     import grpc
     import ray
+    from ray.exceptions import RayError
 
     host = address.removeprefix("ray://")
     wanted = "wanted HOST:PORT of a Ray head that runs, or unset it for a Ray of this run's own"
@@ -87,7 +88,7 @@ def _join(address: str) -> None:
         ray.init(address, logging_level=logging.WARNING)
     except grpc.FutureTimeoutError:
         raise UserError(f"RAY_ADDRESS: got {address}, where no Ray answers; {wanted}") from None
-    except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
+    except (ConnectionError, RuntimeError, ValueError, RayError) as error:
         raise UserError(f"RAY_ADDRESS: got {address}, which cannot be joined: {error_line(error)}; {wanted}") from error
 
 

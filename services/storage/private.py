@@ -10,8 +10,8 @@ from pathlib import Path
 from dmil_core.errors import UserError
 
 PREFIX = "dmil-"
-LONGEST_BASE = 16
-"""Bytes: a socket's path has 107 at most, and Ray's sockets lie up to 90 deeper."""
+LONGEST_BASE = 18
+"""Bytes: a socket's path has 107 at most, and Ray's sockets lie up to 89 deeper."""
 LOOPBACK = "localhost,127.0.0.1,::1"
 
 
@@ -56,4 +56,4 @@ def bypass_proxies(environment: MutableMapping[str, str]) -> None:
     given = environment.get("no_proxy") or environment.get("NO_PROXY") or ""
     if given != "*" and LOOPBACK not in given:
         given = f"{given},{LOOPBACK}".removeprefix(",")
-    environment |= {"no_proxy": given, "NO_PROXY": given}
+    environment.update(no_proxy=given, NO_PROXY=given)

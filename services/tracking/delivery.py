@@ -54,10 +54,10 @@ class Identity(BaseModel):
     name: str
     began: int
     """In milliseconds since 1970."""
-    parent: str | None = Field(None, pattern=ID)
+    parent: str | None = Field(default=None, pattern=ID)
     """The tag of the run that this one is a trial of; it goes to the same MLflow experiment."""
-    run_id: str | None = Field(None, pattern=ID)
-    experiment_id: str | None = Field(None, pattern="^[0-9]{1,32}$")
+    run_id: str | None = Field(default=None, pattern=ID)
+    experiment_id: str | None = Field(default=None, pattern="^[0-9]{1,32}$")
     """Noted with the run's, but not in files of older versions."""
     delivered: int = 0
     """How many records MLflow has taken."""

@@ -24,6 +24,8 @@ client = connect(os.environ['MLFLOW_TRACKING_URI'])
 run = client.create_run(client.create_experiment('x')).info
 client.log_artifact(run.run_id, 'artifact')
 print(client.list_artifacts(run.run_id)[0].file_size, 'bytes below', run.artifact_uri)"""
+PROXY = "http://127.0.0.1:9"
+"""Where nobody listens."""
 SUBMIT = [sys.executable, "-m", "ray.scripts.scripts", "job", "submit"]
 
 
@@ -46,8 +48,9 @@ def started(
 ) -> Iterator[tuple[Path, str]]:
     """A cluster of its own, and what it said when it was started."""
     before = set(Path("/dev/shm").iterdir())
-    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")  # where nobody listens
-    code, printed = programs("local_cluster", "start", *ports)
+    with monkeypatch.context() as behind_a_proxy:
+        behind_a_proxy.setenv("http_proxy", PROXY)
+        code, printed = programs("local_cluster", "start", *ports)
     assert code == 0, printed
     yield workplace / "cluster", printed
     if (workplace / "cluster" / "cluster.json").exists():
@@ -78,16 +81,12 @@ def test_a_cluster_takes_jobs_with_its_token_and_leaves_nothing_behind(started, 
     listening = {connection.laddr[0] for connection in connections if connection.status == psutil.CONN_LISTEN}
     assert listening
     assert all(ipaddress.ip_address(address.removeprefix("::ffff:")).is_loopback for address in listening)
-    record = json.loads((folder / "cluster.json").read_text())
-    found = doors(folder, Path(record["temporary"]), *(process["pid"] for process in record["processes"]))
-    if found is not None:
-        assert found.doors == ["GET /: 200", "Prometheus's figures"]  # the dashboard's empty page, Ray's metrics
-        assert min(found.ports, found.sockets) > 5
-        assert found.paths > 50
 
     command = next(line for line in printed.splitlines() if "job submit" in line).partition(" -- ")[0]
     job = f'{sys.executable} -c "{JOB}"'
-    submitted = subprocess.run(f"{command} -- {job}", shell=True, capture_output=True, text=True)
+    submitted = subprocess.run(
+        f"{command} -- {job}", shell=True, capture_output=True, text=True, env={**os.environ, "http_proxy": PROXY}
+    )
     assert submitted.returncode == 0, submitted.stdout + submitted.stderr
     assert f"to {mlflow} {folder.parent}" in submitted.stdout
     assert "3000 bytes below mlflow-artifacts:/" in submitted.stdout
@@ -95,10 +94,17 @@ def test_a_cluster_takes_jobs_with_its_token_and_leaves_nothing_behind(started, 
     for environment, complaint in (({}, "Missing"), ({"RAY_AUTH_TOKEN": "0" * 64}, "Invalid")):
         refused = subprocess.run(
             [*SUBMIT, "--address", dashboard, "--", "true"], capture_output=True, text=True,
-            env={**os.environ, "no_proxy": "*", "RAY_AUTH_MODE": "token" if environment else "disabled", **environment},
+            env={**os.environ, "RAY_AUTH_MODE": "token" if environment else "disabled", **environment},
         )  # fmt: skip
         assert refused.returncode == 1
         assert complaint in refused.stdout + refused.stderr
+
+    record = json.loads((folder / "cluster.json").read_text())
+    found = doors(folder, Path(record["temporary"]), *(process["pid"] for process in record["processes"]))
+    if found is not None:
+        assert found.doors == ["GET /: 200", "Prometheus's figures"]  # the dashboard's empty page, Ray's metrics
+        assert min(found.ports, found.sockets) > 5
+        assert found.paths > 50
 
     code, said = programs("local_cluster", "start")
     assert code == 2

@@ -130,8 +130,9 @@ def test_a_run_on_ray_lets_nobody_in_and_keeps_its_secrets_when_it_fails(
     assert "python -m services.tracking flush runs/run" in printed
     if let_in is not None:
         assert let_in.doors == []
-        assert min(let_in.ports, let_in.paths) > 5
+        assert let_in.ports > 5
         assert let_in.sockets > 1
+        assert let_in.paths > 50
     assert list(short_folder.iterdir()) == [], "what Ray made is gone"
     assert not (workplace / ".ray").exists()
     assert any("gcs_server" in path.name for path in (workplace / "of-ray").rglob("*.out")), "Ray's logs are elsewhere"
