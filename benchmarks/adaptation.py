@@ -43,7 +43,7 @@ class Arguments(BenchmarkArguments):
     """How often each is timed; the table shows medians."""
 
 
-class Contest(NamedTuple):
+class Comparison(NamedTuple):
     """What is timed, how often in one call, and the most seconds that ours may take once."""
 
     name: str
@@ -55,12 +55,12 @@ class Contest(NamedTuple):
 def run(args: Arguments) -> Sequence[Row]:
     """Run the benchmark."""
     torch.set_num_threads(1)
-    rows = [_measure(contest, args.rounds) for contest in (*_dmil(args), _mil(args))]
+    rows = [_measure(comparison, args.rounds) for comparison in (*_dmil(args), _mil(args))]
     console.print(lay_out("adaptation and acting on one core", [_cells(row) for row in rows]))
     return rows
 
 
-def _mil(args: Arguments) -> Contest:
+def _mil(args: Arguments) -> Comparison:
     config = MilConfig()
     method = Mil(config, ACTION_DIM, Normalisation.identity(OBS_DIM))
     parameters = method.initial_parameters(named_rng(0, "benchmark parameters"))
@@ -77,55 +77,55 @@ def _mil(args: Arguments) -> Contest:
     numbers = torch.randn(sum(used) + sum(view.numel() for layer in policy.cache for view in layer))
     observations, memory = draw_steps(1, 1, 1).states.numpy(), policy.start(1)
     rivals = {"ours": lambda: policy.act(observations, memory), "floor": lambda: numbers.sum()}
-    return Contest("MIL: act in 1 state", rivals, CALLS, 3e-3)
+    return Comparison("MIL: act in 1 state", rivals, CALLS, 3e-3)
 
 
-def _dmil(args: Arguments) -> list[Contest]:
+def _dmil(args: Arguments) -> list[Comparison]:
     config = settings("paper", args.sub_skills, "second")
     parameters, support = draw_parameters(config), draw_steps(0, args.shots, 100)
     steps, rate = args.fine_tuning_steps, 1e-3
     config = config.model_copy(update={"inner_learning_rate": rate})
-    twin, hierarchy = MaskedTwin(config), Hierarchy.of(as_in_a_run(parameters))
+    masked, hierarchy = MaskedTwin(config), Hierarchy.of(as_in_a_run(parameters))
 
     def ours() -> Hierarchy:
         return adapt(hierarchy, support, support, config, steps=steps)
 
-    def theirs() -> dict[str, Tensor]:
-        return {name: tensor.detach() for name, tensor in twin.adapt(parameters, support, steps, rate).items()}
+    def of_masked() -> dict[str, Tensor]:
+        return {name: tensor.detach() for name, tensor in masked.adapt(parameters, support, steps, rate).items()}
 
-    policy, adapted = DmilPolicy(ours(), Normalisation.identity(OBS_DIM)), theirs()
+    policy, adapted = DmilPolicy(ours(), Normalisation.identity(OBS_DIM)), of_masked()
     difference = max((policy.hierarchy.parameters[name] - adapted[name]).abs().max().item() for name in adapted)
     assert difference < 1e-3, f"ours and the twin differ by {difference}"
     weights = torch.randn(sum(layer.weight.numel() for layer in (*hierarchy.high, *hierarchy.low[0])))
 
-    def acting(states: int, target: float) -> Contest:
+    def acting(states: int, target: float) -> Comparison:
         observations, memory = draw_steps(1, 1, states).states, policy.start(states)
         rivals = {
             "ours": lambda: policy.act(observations.numpy(), memory),
-            "twin": lambda: twin.act(adapted, observations),
+            "twin": lambda: masked.act(adapted, observations),
             "floor": lambda: weights.sum(),
         }
-        return Contest(f"act in {states} state{'s' * (states > 1)}", rivals, CALLS, target)
+        return Comparison(f"act in {states} state{'s' * (states > 1)}", rivals, CALLS, target)
 
-    adapting = Contest(f"adapt, {args.shots} shot, {steps} steps", {"ours": ours, "twin": theirs}, 1, 1.5)
+    adapting = Comparison(f"adapt, {args.shots} shot, {steps} steps", {"ours": ours, "twin": of_masked}, 1, 1.5)
     return [adapting, acting(1, 150e-6), acting(20, 500e-6)]
 
 
-def _measure(contest: Contest, rounds: int) -> dict[str, Any]:
+def _measure(comparison: Comparison, rounds: int) -> dict[str, Any]:
     """Return the row of one contest; seconds are those of one adaptation or one action."""
 
     def repeated(function: Callable[[], object]) -> Callable[[], object]:
-        return lambda: [function() for _ in range(contest.times)]
+        return lambda: [function() for _ in range(comparison.times)]
 
-    timed = alternate({name: repeated(function) for name, function in contest.rivals.items()}, rounds)
-    seconds = {name: median(spent) / contest.times for name, spent in timed.items()}
+    timed = alternate({name: repeated(function) for name, function in comparison.rivals.items()}, rounds)
+    seconds = {name: median(spent) / comparison.times for name, spent in timed.items()}
     return {
-        "what": contest.name,
+        "what": comparison.name,
         "seconds": seconds["ours"],
         "twin_seconds": seconds.get("twin"),
         "ratio": seconds["twin"] / seconds["ours"] if "twin" in seconds else None,
         "floor_seconds": seconds.get("floor"),
-        "target_seconds": contest.target,
+        "target_seconds": comparison.target,
         "rounds": rounds,
     }
 
@@ -134,15 +134,15 @@ def _cells(row: Row) -> dict[str, str]:
     verdict = "met" if row["seconds"] <= row["target_seconds"] else "missed"
     return {
         "what": row["what"],
-        "ours": _in_words(row["seconds"]),
-        "at most": f"{_in_words(row['target_seconds'])} ({verdict})",
-        "twin": _in_words(row["twin_seconds"]),
+        "ours": _describe(row["seconds"]),
+        "at most": f"{_describe(row['target_seconds'])} ({verdict})",
+        "twin": _describe(row["twin_seconds"]),
         "faster": f"{row['ratio']:.2f}x" if row["ratio"] else "",
-        "reading the weights": _in_words(row["floor_seconds"]),
+        "reading the weights": _describe(row["floor_seconds"]),
     }
 
 
-def _in_words(seconds: float | None) -> str:
+def _describe(seconds: float | None) -> str:
     if seconds is None:
         return ""
     return f"{seconds:.2f} s" if seconds >= 0.1 else f"{seconds * 1e6:.0f} µs"

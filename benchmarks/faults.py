@@ -199,11 +199,11 @@ def _cells(kind: str, counts: Counter[str], cost: float | None) -> dict[str, str
 
 
 def _counts(outcomes: Sequence[Outcome], wanted: str | None, kind: str = "all") -> Counter[str]:
-    found: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     for outcome in outcomes:
         became = "lost" if outcome.found is None else "equal" if outcome.found == wanted else "different"
-        found[became] += outcome.kills.total() if kind == "all" else outcome.kills[kind]
-    return found
+        counts[became] += outcome.kills.total() if kind == "all" else outcome.kills[kind]
+    return counts
 
 
 def run(args: Arguments) -> Row:

@@ -160,9 +160,9 @@ def measure(size: Size, order: Literal["first", "second"], sub_skills: int, roun
     """Return the row of one configuration; seconds are those of one task."""
     config, tasks = settings(size, sub_skills, order), TASKS[size]
     parameters, sets = draw_parameters(config), [draw_sets(size, config, task) for task in range(tasks)]
-    twin = MaskedTwin(config)
+    masked = MaskedTwin(config)
     ours = task_gradient(parameters, *sets[0], config).gradient
-    error = ((ours - (plain := twin.gradient(parameters, sets[0])[0])).norm() / plain.norm()).item()
+    error = ((ours - (plain := masked.gradient(parameters, sets[0])[0])).norm() / plain.norm()).item()
     with _workers(config, size) as everywhere:
         everywhere("gradients")
         peak = max(everywhere("peak_megabytes"))
@@ -170,7 +170,7 @@ def measure(size: Size, order: Literal["first", "second"], sub_skills: int, roun
         seconds = alternate(
             {
                 "ours": lambda: everywhere("gradients"),
-                "twin": lambda: [twin.gradient(parameters, one) for one in sets],
+                "twin": lambda: [masked.gradient(parameters, one) for one in sets],
                 "roofline": lambda: everywhere("bare_products"),
             },
             rounds,

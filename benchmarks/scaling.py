@@ -90,7 +90,7 @@ def measure(trainings: Mapping[str, MetaTraining], turns: Turns) -> dict[str, li
 
 def rows_of(size: Size, trainings: Mapping[str, MetaTraining], timings: Mapping[str, list[Timing]]) -> list[Row]:
     """Return a row for each rival."""
-    seconds = {name: float(np.median([timing.iteration for timing in found])) for name, found in timings.items()}
+    seconds = {name: float(np.median([timing.iteration for timing in of_name])) for name, of_name in timings.items()}
     rows = []
     for name, training in trainings.items():
         workers, parameters, gradients = 1, 0, 0
@@ -118,14 +118,14 @@ def rows_of(size: Size, trainings: Mapping[str, MetaTraining], timings: Mapping[
 
 def misses(rows: Sequence[Row]) -> list[str]:
     """Return the targets that two workers miss, in words."""
-    found = []
+    missed = []
     for row in rows:
         if row.runner == "ray" and row.workers == 2:
             if row.overhead_share > OVERHEAD[row.size]:
-                found.append(f"{row.size}: overhead {row.overhead_share:.1%}, wanted {OVERHEAD[row.size]:.0%} at most")
+                missed.append(f"{row.size}: overhead {row.overhead_share:.1%}, wanted {OVERHEAD[row.size]:.0%} at most")
             if row.speedup < SPEEDUP:
-                found.append(f"{row.size}: speedup {row.speedup:.2f}, wanted {SPEEDUP} at least")
-    return found
+                missed.append(f"{row.size}: speedup {row.speedup:.2f}, wanted {SPEEDUP} at least")
+    return missed
 
 
 def cells(row: Row) -> dict[str, str]:

@@ -259,14 +259,14 @@ def one_policy(
     """
     config = PRESETS["ml10-quick"]
     demonstrations: dict[str, list[Demonstration]] = {task: [] for task in tasks}
-    for task, found in demonstrations.items():
+    for task, of_task in demonstrations.items():
         env, seed = suite.make_env(task), 0
-        while len(found) < DRAWS:
+        while len(of_task) < DRAWS:
             attempt = demonstrate(suite.expert(task), env, seed, EXPERT_STEPS, config.demonstrations)
             if attempt.solved_at is not None:
-                found.append(Demonstration(str(seed), task, attempt.observations[:-1], attempt.actions))
+                of_task.append(Demonstration(str(seed), task, attempt.observations[:-1], attempt.actions))
             seed += 1
-    support = [demonstration for found in demonstrations.values() for demonstration in found]
+    support = [demonstration for of_task in demonstrations.values() for demonstration in of_task]
     assert isinstance(config.method, DmilConfig)
     method = Dmil.prepared(config.method, suite.action_dim, support)
     initial = method.initial_parameters(named_rng(config.seed, "initial parameters"))
@@ -296,7 +296,7 @@ def evaluation_row(args: Arguments) -> dict[str, Any]:
     plan = plan_adaptations([("meta-testing", task) for task in tasks], settings)
     shapes = {name: tensor.shape for name, tensor in parameters.items()}
     flat = partial(np.array, flatten(parameters).numpy())
-    held_out = {task: partial(list, found) for task, found in demonstrations.items()}
+    held_out = {task: partial(list, of_task) for task, of_task in demonstrations.items()}
     items = [
         AdaptationRollouts(method, shapes, flat, adaptation, held_out[adaptation.task], settings, 0)
         for adaptation in plan

@@ -142,8 +142,8 @@ def measured_costs(plan: Plan, rounds: int) -> Costs:
             add=FAN_IN * parameters.nbytes / least(rounds, lambda: add(gradients), time.process_time),
             demonstrations=sum(
                 demonstration.observations.nbytes + demonstration.actions.nbytes
-                for held in plan.demonstrations.values()
-                for demonstration in held
+                for of_task in plan.demonstrations.values()
+                for demonstration in of_task
             ),
             resident=1024 * int(status.partition("VmHWM:")[2].split()[0]),
         )
@@ -216,7 +216,7 @@ def cells_grown(row: Row) -> dict[str, str]:
     }
 
 
-def in_words(costs: Costs) -> str:
+def describe(costs: Costs) -> str:
     """Return what was measured, in words."""
     return (
         f"slot {1e3 * costs.slot:.1f} ms ± {costs.spread:.1%}, step {1e3 * costs.step:.2f} ms, call "
@@ -238,7 +238,7 @@ def run(args: Arguments) -> Sequence[harness.Row]:
         for preset in args.presets:
             training = PRESETS[preset].training
             costs = measured_costs(made_up_plan(preset), args.rounds)
-            console.print(f"\n{preset}, {training.iterations} iterations; measured: {in_words(costs)}")
+            console.print(f"\n{preset}, {training.iterations} iterations; measured: {describe(costs)}")
             if args.faster != 1:
                 console.print(f"assumed: a slot takes {args.faster:g} times less")
             costs = costs._replace(slot=costs.slot / args.faster)

@@ -206,17 +206,17 @@ def preset_of(suite: str, preset: str, method: str = DEFAULT_METHOD) -> Experime
         KeyError: for an unknown preset.
         UserError: for an unknown method.
     """
-    config, own = BASE_PRESETS[preset], config_type(method)
+    config, method_config = BASE_PRESETS[preset], config_type(method)
     changes: dict[str, dict[str, Any]] = {"method": {"name": method}, "suite": {"name": suite}}
     if preset == "smoke" and suite in SMOKE_TASKS:
         changes["suite"] |= dict(zip(("train_tasks", "test_tasks"), SMOKE_TASKS[suite], strict=True))
     if suite.startswith("kitchen"):
-        if "sub_skills" in own.model_fields:
+        if "sub_skills" in method_config.model_fields:
             changes["method"]["sub_skills"] = 4  # Table 5's middle column
         if preset == "quick":
             changes["demonstrations"] = {"per_task": 50, "held_out": 12}  # a demonstration takes 1 s
     settings = config.model_dump(exclude={"method"}) | {"method": {}}
-    for changed in (own.presets.get(preset, {}), changes):
+    for changed in (method_config.presets.get(preset, {}), changes):
         settings |= {section: settings[section] | values for section, values in changed.items()}
     return ExperimentConfig.model_validate(settings)
 

@@ -106,11 +106,11 @@ def routed(
     networks: Sequence[Network], states: Float[Tensor, "steps obs_dim"], chosen: Int[Tensor, " steps"]
 ) -> Float[Tensor, "steps outputs"]:
     """Return at each state the output of its chosen network, which alone is computed there."""
-    own = own_states(chosen, len(networks))
-    used = [k for k, index in enumerate(own) if len(index)] or [0]
+    indices = own_states(chosen, len(networks))
+    used = [k for k, index in enumerate(indices) if len(index)] or [0]
     if len(used) == 1:
         return mlp(networks[used[0]], states)
-    return torch.cat([mlp(networks[k], states[own[k]]) for k in used])[torch.cat(own).argsort()]
+    return torch.cat([mlp(networks[k], states[indices[k]]) for k in used])[torch.cat(indices).argsort()]
 
 
 def leaves(parameters: Parameters, *, copy: bool = False) -> dict[str, Tensor]:

@@ -21,19 +21,19 @@ def plug_ins(group: str, ours: Callable[[str], str | None]) -> dict[str, Any]:
     Raises:
         UserError: if a package registers a name of ours, or two packages one name; whatever name is asked for.
     """
-    found: dict[str, Any] = {}
+    points: dict[str, Any] = {}
     for point in entry_points(group=group):
-        if (own := ours(point.name)) is not None:
+        if (taken := ours(point.name)) is not None:
             raise UserError(
-                f"entry points {group}: got {point.name} twice, {own} and {_described(point)}; wanted another name "
+                f"entry points {group}: got {point.name} twice, {taken} and {_described(point)}; wanted another name "
                 "than any of ours; rename the package's, or uninstall it"
             )
-        if (other := found.setdefault(point.name, point)).value != point.value:
+        if (other := points.setdefault(point.name, point)).value != point.value:
             raise UserError(
                 f"entry points {group}: got {point.name} twice, {_described(other)} and {_described(point)}; wanted "
                 "one package for each name; uninstall either"
             )
-    return found
+    return points
 
 
 def imported(point: Any, field: str) -> Any:

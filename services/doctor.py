@@ -123,33 +123,33 @@ def _versions(nodes: Sequence[NodeFacts]) -> Finding:
     remedy = "install the same constraints.txt on all nodes; results depend on these"
     if differing:
         return Finding("versions", "bad", "; ".join(sorted(differing)), remedy)
-    told = ", ".join(f"{name} {version}" for name, version in first.versions.items())
+    text = ", ".join(f"{name} {version}" for name, version in first.versions.items())
     if len({node.packages for node in nodes}) > 1:
-        return Finding("versions", "warning", f"{told}; other packages differ between nodes", remedy)
-    return Finding("versions", "good", told)
+        return Finding("versions", "warning", f"{text}; other packages differ between nodes", remedy)
+    return Finding("versions", "good", text)
 
 
 def _enough(what: str, got: int, wanted: int, remedy: str) -> Finding:
-    told = f"{got / 1e9:.1f} GB, wanted {wanted / 1e9:.1f}"
-    return Finding(what, "good", told) if got >= wanted else Finding(what, "bad", told, remedy)
+    text = f"{got / 1e9:.1f} GB, wanted {wanted / 1e9:.1f}"
+    return Finding(what, "good", text) if got >= wanted else Finding(what, "bad", text, remedy)
 
 
 def _cpus(node: NodeFacts) -> Finding:
     what = f"{node.name}: CPUs"
     if node.cpus > node.cores:
-        told = f"Ray counts {node.cpus:g}, there are {node.cores} cores"
-        return Finding(what, "warning", told, "workers would share cores: ray start --num-cpus with as many as cores")
+        text = f"Ray counts {node.cpus:g}, there are {node.cores} cores"
+        return Finding(what, "warning", text, "workers would share cores: ray start --num-cpus with as many as cores")
     if node.threads not in (None, "1"):
-        told = f"{node.cores} cores, OMP_NUM_THREADS={node.threads}"
-        return Finding(what, "warning", told, "a worker computes on one thread: unset it, or set it to 1")
+        text = f"{node.cores} cores, OMP_NUM_THREADS={node.threads}"
+        return Finding(what, "warning", text, "a worker computes on one thread: unset it, or set it to 1")
     return Finding(what, "good", f"{node.cpus:g} workers at a time, one thread each, on {node.cores} cores")
 
 
 def _clock(node: NodeFacts) -> Finding:
-    told = f"{node.skew:+.2f} s from this machine's"
+    text = f"{node.skew:+.2f} s from this machine's"
     if abs(node.skew) <= SKEW_SECONDS:
-        return Finding(f"{node.name}: clock", "good", told)
-    return Finding(f"{node.name}: clock", "warning", told, "records would be out of order: let NTP set the clocks")
+        return Finding(f"{node.name}: clock", "good", text)
+    return Finding(f"{node.name}: clock", "warning", text, "records would be out of order: let NTP set the clocks")
 
 
 def _storage(what: str, folder: Path, mark: str) -> Iterator[Finding]:

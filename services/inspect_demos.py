@@ -86,7 +86,7 @@ def _demonstration(episode: ExternalEpisode, index: int, suite: TaskSuite | None
 
 def _problems(episodes: Sequence[ExternalEpisode], suite: TaskSuite | None) -> Iterator[str]:
     """Yield what keeps a data set from being learned from, and what looks like a mistake."""
-    seen: dict[bytes, int] = {}
+    first_with: dict[bytes, int] = {}
     for index, one in enumerate(episodes):
         try:
             demonstration = _demonstration(one, index, suite)
@@ -101,7 +101,7 @@ def _problems(episodes: Sequence[ExternalEpisode], suite: TaskSuite | None) -> I
             yield f"episode {index}: the same action at every step"
         if one.success is False:
             yield f"episode {index}: no step is a success"
-        before = seen.setdefault(one.observations.tobytes() + one.actions.tobytes(), index)
+        before = first_with.setdefault(one.observations.tobytes() + one.actions.tobytes(), index)
         if before != index:
             yield f"episode {index}: the same as episode {before}"
 

@@ -44,7 +44,7 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
         "in_place=not keep and gradient.network is not origin": "in_place=not keep",
     },
     ("dmil_core/networks.py", "dmil_core/methods/dmil/test_adaptation.py"): {
-        "[torch.cat(own).argsort()]": "[torch.cat(own)]",
+        "[torch.cat(indices).argsort()]": "[torch.cat(indices)]",
     },
     ("dmil_core/outer_loop.py", "dmil_core/test_outer_loop.py"): {
         "draw.permutation(len(tasks))": "draw.integers(len(tasks), size=len(tasks))",
@@ -108,7 +108,7 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
         "steps.sum(1, keepdims=True) > 0.1": "steps.sum(1, keepdims=True) > 0.5",
     },
     ("services/evaluation/comparison.py", "services/sweeps/test_tables.py"): {
-        '"yes, higher" if found.low > 0': '"yes, higher" if found.high > 0',
+        '"yes, higher" if low > 0': '"yes, higher" if found.high > 0',
     },
     ("services/cli/composition.py", "services/cli/test_arguments.py"): {
         "suite or named or DEFAULT_SUITE": "named or suite or DEFAULT_SUITE",

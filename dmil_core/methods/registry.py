@@ -81,10 +81,10 @@ def _ours(name: str) -> str | None:
 
 def _loaded(point: Any) -> type[Method[Any]]:
     """Import the class that a package registers."""
-    found = imported(point, "method.name")
-    if not (isinstance(found, type) and issubclass(found, Method)):
+    method = imported(point, "method.name")
+    if not (isinstance(method, type) and issubclass(method, Method)):
         raise UserError(
-            f"method.name: got {point.name}, {point.value}: got {shorten(found)}; wanted a class derived from "
+            f"method.name: got {point.name}, {point.value}: got {shorten(method)}; wanted a class derived from "
             f"Method; see {GUIDE}"
         )
-    return found
+    return method

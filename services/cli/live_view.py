@@ -86,7 +86,7 @@ class Status(NamedTuple):
     def rows(self, width: int) -> Iterator[tuple[str, "Text | Strip"]]:
         """Yield label and content of each row, for contents of so many columns."""
         if self.losses:
-            yield "losses", _packed(_losses_in_words(self.losses), width)
+            yield "losses", _packed(_describe_losses(self.losses), width)
         if len(self.shares) > 1:
             yield "sub-skills", Strip(self.shares)
             yield "", _packed((f"{index} {share:.0%}" for index, share in enumerate(self.shares)), width)
@@ -97,7 +97,7 @@ class Status(NamedTuple):
                 yield "success", _packed([f"{split} {tallies[0]}", *tallies[1:], when], width)
                 when = ""
         if self.workers:
-            yield "workers", _packed(map(_workers_in_words, self.workers), width)
+            yield "workers", _packed(map(_describe_workers, self.workers), width)
         if self.at:
             yield "at", _packed(self.at.split("; "), width)
 
@@ -179,7 +179,7 @@ def _is_dark(colour: str) -> bool:
     return 0.299 * red + 0.587 * green + 0.114 * blue < 128
 
 
-def _losses_in_words(losses: Mapping[str, float]) -> Iterator[str]:
+def _describe_losses(losses: Mapping[str, float]) -> Iterator[str]:
     """Yield each loss, and one that is known before and after adaptation as a pair."""
     for name, value in losses.items():
         stem, _, when = name.rpartition("_")
@@ -193,7 +193,7 @@ def _plain(name: str) -> str:
     return name.removesuffix("_loss").replace("_", " ")
 
 
-def _workers_in_words(workers: Workers) -> str:
+def _describe_workers(workers: Workers) -> str:
     return f"{workers.kind} {workers.alive} alive, {workers.restarted} restarted"
 
 

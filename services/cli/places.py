@@ -20,14 +20,14 @@ def announce(**places: tuple[Path | None, str]) -> None:
     Raises:
         UserError: if one is in Ray's own folder, as in a job with ``--working-dir``; nothing is printed then.
     """
-    found = {what: path.resolve() for what, (path, _) in places.items() if path is not None}
-    if passing := [what for what, path in found.items() if RAY_FOLDER.search(str(path))]:
-        got = "; ".join(f"{what}: got {found[what]}" for what in passing)
+    resolved = {what: path.resolve() for what, (path, _) in places.items() if path is not None}
+    if passing := [what for what, path in resolved.items() if RAY_FOLDER.search(str(path))]:
+        got = "; ".join(f"{what}: got {resolved[what]}" for what in passing)
         remedies = [places[what][1] for what in passing]
         raise UserError(
             f"{got}; Ray deletes that with its cluster; wanted what stays: give, with absolute paths, "
             f"{' '.join(remedies)}; a job is given variables by ray job submit --runtime-env-json "
             """'{"env_vars": {"NAME": "VALUE"}}'"""
         )
-    for what, path in found.items():
+    for what, path in resolved.items():
         console.print(f"{what}: {path}", markup=False, soft_wrap=True)

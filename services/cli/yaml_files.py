@@ -22,17 +22,17 @@ def merged(settings: Mapping[str, Any], values: Mapping[Any, Any], origin: str, 
     Raises:
         UserError: for one that there is not.
     """
-    found = dict(settings)
+    result = dict(settings)
     for key, value in values.items():
-        if key not in found:
+        if key not in result:
             named = key if isinstance(key, str) and len(key) < 50 else shorten(key)
-            raise UserError(f"{origin}: got the unknown key {prefix}{named}; wanted one of {', '.join(found)}")
-        if isinstance(found[key], dict):
+            raise UserError(f"{origin}: got the unknown key {prefix}{named}; wanted one of {', '.join(result)}")
+        if isinstance(result[key], dict):
             if not isinstance(value, dict):
-                raise UserError(f"{origin}: {prefix}{key}: got {shorten(value)}; wanted keys: {', '.join(found[key])}")
-            value = merged(found[key], value, origin, f"{prefix}{key}.")
-        found[key] = value
-    return found
+                raise UserError(f"{origin}: {prefix}{key}: got {shorten(value)}; wanted keys: {', '.join(result[key])}")
+            value = merged(result[key], value, origin, f"{prefix}{key}.")
+        result[key] = value
+    return result
 
 
 def read_yaml(file: Path, flag: str) -> dict[Any, Any]:

@@ -18,7 +18,7 @@ from services.suites.base import TaskSuite
 
 CHUNK = 10
 """Attempts of an expert in one call to a simulation worker."""
-PATIENCE = 10
+MOST_ATTEMPTS_EACH = 10
 """So many attempts for each wanted demonstration, then the expert is given up."""
 
 
@@ -50,12 +50,13 @@ class DemonstrationCollection:
             DemonstrationError: if an expert hardly ever succeeds, a task has none, or a data set cannot be used.
         """
         settings = self._config.demonstrations
-        found = self._recorded()
-        ids = {task: self._store.dataset_id(task, self._suite, settings) for task in self._names if task not in found}
+        datasets = self._recorded()
+        wanted = [task for task in self._names if task not in datasets]
+        ids = {task: self._store.dataset_id(task, self._suite, settings) for task in wanted}
         missing = []
         for task, dataset_id in ids.items():
             if (dataset := self._store.load(dataset_id, task)) is not None:
-                found[task] = self._checked(dataset)
+                datasets[task] = self._checked(dataset)
             elif self._suite.expert(task) is None:
                 raise DemonstrationError(
                     f"demonstrations.source: got nothing for {task}, which has no scripted expert; wanted a data set: "
@@ -67,14 +68,14 @@ class DemonstrationCollection:
             for task, attempts in made:
                 solved = [index for index, attempt in enumerate(attempts) if attempt.solved_at is not None]
                 kept = solved[: settings.per_task]
-                found[task] = self._store.save(
+                datasets[task] = self._store.save(
                     ids[task],
                     task,
                     [attempts[index] for index in kept],
                     failed=kept[-1] + 1 - len(kept),
                     settings={"protocol": self._suite.protocol, **settings.model_dump()},
                 )
-        return {task: found[task] for task in self._names}
+        return {task: datasets[task] for task in self._names}
 
     def _checked(self, dataset: TaskDemonstrations) -> TaskDemonstrations:
         """Return a stored data set that fits the suite, which may have been changed since."""
@@ -101,9 +102,9 @@ class DemonstrationCollection:
     def _recorded(self) -> dict[str, TaskDemonstrations]:
         """Read the data sets that the settings name."""
         settings, evaluation = self._config.demonstrations, self._config.evaluation
-        found = {task: demonstrations(task, at, self._suite, settings.per_task) for task, at in self._places.items()}
+        datasets = {task: demonstrations(task, at, self._suite, settings.per_task) for task, at in self._places.items()}
         support = max(evaluation.shots) * evaluation.support_draws
-        for task, dataset in found.items():
+        for task, dataset in datasets.items():
             wanted = settings.held_out + 1 if task in self._suite.train_tasks else support
             if (got := len(dataset.demonstrations)) < wanted:
                 raise DemonstrationError(
@@ -112,7 +113,7 @@ class DemonstrationCollection:
                     "one more than demonstrations.held_out; record more, or lower that, evaluation.shots or "
                     "evaluation.support_draws"
                 )
-        return found
+        return datasets
 
     def _attempt(self, runner: Runner, tasks: Sequence[str]) -> Generator[tuple[str, list[Episode]]]:
         """Yield each task's attempts as soon as enough are successes, in the order of their numbers."""
@@ -134,7 +135,7 @@ class DemonstrationCollection:
                 items: list[ExpertAttempts] = []
                 for task in attempts:
                     first = len(attempts[task])
-                    if first >= PATIENCE * settings.per_task:
+                    if first >= MOST_ATTEMPTS_EACH * settings.per_task:
                         raise DemonstrationError(
                             f"task {task}: its expert solved {settings.per_task - lacking(task)} of {first} attempts; "
                             f"wanted {settings.per_task} demonstrations; take less noise or a longer horizon"
@@ -152,7 +153,7 @@ class DemonstrationCollection:
                         at = task
                         bar.advance(sum(attempt.solved_at is not None for attempt in made))
                         if not left[task]:
-                            own = [number for number, item in enumerate(items) if item.task == task]
-                            attempts[task] += [attempt for number in own for attempt in results.pop(number)]
+                            of_task = [number for number, item in enumerate(items) if item.task == task]
+                            attempts[task] += [attempt for number in of_task for attempt in results.pop(number)]
                             if lacking(task) <= 0:
                                 yield task, attempts.pop(task)

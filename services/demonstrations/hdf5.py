@@ -34,8 +34,8 @@ class PlainFile:
 
     def names(self, group: str = "/") -> list[str]:
         """Return the names in a group, in alphabetical order; none for an array or where there is nothing."""
-        found = self._member(group)
-        return sorted(found) if isinstance(found, h5py.Group) else []
+        member = self._member(group)
+        return sorted(member) if isinstance(member, h5py.Group) else []
 
     def has(self, name: str) -> bool:
         """Return whether there is something under a path of the file."""
@@ -67,15 +67,15 @@ class PlainFile:
 
     def _member(self, path: str) -> h5py.Group | h5py.Dataset | None:
         """Return what lies under a path, reached by hard links only; they cannot lead out of the file."""
-        found: h5py.Group | h5py.Dataset | None = self._file
+        node: h5py.Group | h5py.Dataset | None = self._file
         for part in filter(None, path.split("/")):
-            if not isinstance(found, h5py.Group) or part not in found:
+            if not isinstance(node, h5py.Group) or part not in node:
                 return None
-            if not isinstance(found.get(part, getlink=True), h5py.HardLink):
+            if not isinstance(node.get(part, getlink=True), h5py.HardLink):
                 raise DemonstrationError(f"{path}: got a link; wanted the array itself, in this file")
-            member = found[part]
-            found = member if isinstance(member, h5py.Group | h5py.Dataset) else None
-        return found
+            member = node[part]
+            node = member if isinstance(member, h5py.Group | h5py.Dataset) else None
+        return node
 
 
 @contextmanager

@@ -73,12 +73,12 @@ class AdaptationWorker:
             WorkError: for a Python error in one of the slots.
         """
         started = time.perf_counter()
-        own = unflatten(torch.from_numpy(from_chunks(parameters)), self._shapes)
+        unflattened = unflatten(torch.from_numpy(from_chunks(parameters)), self._shapes)
         results = [
             group_gradient(
                 self._method,
                 self._demonstrations,
-                own,
+                unflattened,
                 self._seed,
                 block.iteration,
                 block.tasks,

@@ -53,7 +53,7 @@ def facts(runs: str, mark: str, cpus: float | None = None) -> NodeFacts:
     disk = shutil.disk_usage(next(folder for folder in (there, *there.parents) if folder.exists()))
     cores = len(os.sched_getaffinity(0))
     drawing, draws = _drawing()
-    installed = sorted({f"{found.name}=={found.version}" for found in distributions()})
+    installed = sorted({f"{package.name}=={package.version}" for package in distributions()})
     return NodeFacts(
         name=platform.node(),
         versions={"python": platform.python_version(), **library_versions()},
@@ -78,7 +78,7 @@ def cluster_facts(runs: Path, mark: str) -> tuple[list[NodeFacts], list[str]]:
 
     ask = ray.remote(num_cpus=0, max_retries=0)(facts)
     tell_time = ray.remote(num_cpus=0, max_retries=0)(_time)
-    found, silent = [], []
+    nodes, silent = [], []
     for node in (node for node in ray.nodes() if node["Alive"]):
         here = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
 
@@ -87,19 +87,19 @@ def cluster_facts(runs: Path, mark: str) -> tuple[list[NodeFacts], list[str]]:
             return ray.get(asked, timeout=SECONDS_TO_ANSWER)
 
         try:
-            told: NodeFacts = answer(ask, str(runs.absolute()), mark, node["Resources"].get("CPU", 0.0))
-            found.append(told._replace(skew=_skew(partial(answer, tell_time))))
+            node_facts: NodeFacts = answer(ask, str(runs.absolute()), mark, node["Resources"].get("CPU", 0.0))
+            nodes.append(node_facts._replace(skew=_skew(partial(answer, tell_time))))
         except RayError:
             silent.append(f"{node['NodeManagerHostname']} ({node['NodeManagerAddress']})")
-    return found, silent
+    return nodes, silent
 
 
 def _drawing() -> tuple[str, bool]:
     """Return the backend of OpenGL, or what is wrong with it: found by a process of its own, for it may crash."""
     command = "from services.suites.rendering import working_backend; print(working_backend())"
     done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True)
-    told = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
-    return (told[-1] if told else f"ended with {done.returncode}"), done.returncode == 0
+    lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
+    return (lines[-1] if lines else f"ended with {done.returncode}"), done.returncode == 0
 
 
 def _time() -> float:
@@ -111,7 +111,7 @@ def _skew(clock: Callable[[], float]) -> float:
     readings = []
     for _ in range(3):
         before = time.time()
-        told = clock()
+        reading = clock()
         after = time.time()
-        readings.append((after - before, told - (before + after) / 2))
+        readings.append((after - before, reading - (before + after) / 2))
     return min(readings)[1]

@@ -220,9 +220,9 @@ class RayMetaTraining:
             alone = self._pool.submit("gradient", parameters, block._replace(groups=[[slot]]), returns=2, label=label)
             try:
                 self._pool.result(alone)
-            except DeadlyCallError as own:
-                problem = f"{own.call.deaths} workers ended in the course of it, one after the other"
-                raise WorkError(label, problem, str(own), {"iteration": block.iteration, "slot": slot}) from own
+            except DeadlyCallError as deadly:
+                problem = f"{deadly.call.deaths} workers ended in the course of it, one after the other"
+                raise WorkError(label, problem, str(deadly), {"iteration": block.iteration, "slot": slot}) from deadly
         self._pool.retry(call)
 
     def _start_learner(self) -> None:

@@ -106,9 +106,9 @@ class Evaluator:
             episodes += _episode_rows(row, adaptation, outcome)
             adaptations.append(_adaptation_row(row, outcome, sub_skills_of(self.config.method)))
         failed = {task: dataset.failed for task, dataset in self._data.items()}
-        held = {task: len(dataset.demonstrations) for task, dataset in self._data.items()}
+        counts = {task: len(dataset.demonstrations) for task, dataset in self._data.items()}
         suite = self._suite
-        return Evaluation(checkpoint, suite.protocol, suite.best_score, failed, held, episodes, adaptations)
+        return Evaluation(checkpoint, suite.protocol, suite.best_score, failed, counts, episodes, adaptations)
 
     def imitation(self, checkpoint: Checkpoint, outcomes: Iterable[ImitationErrors]) -> list[ImitationResult]:
         """Return a row for each adaptation, from their `AdaptationImitation` in order."""

@@ -57,8 +57,8 @@ def open_promotion(checkpoint: Checkpoint, experiment: Experiment, folder: Path)
     with _asking(uri):
         client = connect(uri)
         challenger = _model_of(client, checkpoint)
-        found = client.search_registered_models(f"name = '{name}'")
-        has_one = bool(found) and ALIAS in found[0].aliases
+        registered = client.search_registered_models(f"name = '{name}'")
+        has_one = bool(registered) and ALIAS in registered[0].aliases
         champion = client.get_model_version_by_alias(name, ALIAS) if has_one else None
         if champion is None or champion.source == _address(challenger.model_id):
             return Promotion(client, uri, experiment, challenger, champion, None, folder)
@@ -76,14 +76,14 @@ def _model_of(client: "MlflowClient", checkpoint: Checkpoint) -> "LoggedModel":
     run_id, home = checkpoint.manifest.mlflow_run_id, checkpoint.path.absolute().parents[1]
     if run_id is None and (home / IDENTITY).exists():  # MLflow was away when the checkpoint was written
         run_id = Identity.of(home).run_id
-    found = [] if run_id is None else models_of(client, client.get_run(run_id))
-    for model in found:
+    models = [] if run_id is None else models_of(client, client.get_run(run_id))
+    for model in models:
         if model.tags.get(CHECKPOINT_TAG) == checkpoint.digest:
             return model
     if run_id is None:
         got = "which has no MLflow run"
     else:
-        got = f"of which MLflow run {run_id} has no model, and {len(found)} of others"
+        got = f"of which MLflow run {run_id} has no model, and {len(models)} of others"
     raise UserError(
         f"--checkpoint: got {checkpoint.path}, {got}; wanted the last checkpoint of a finished run of "
         "services.meta_train; what MLflow did not take while the run was on it takes by: "
@@ -126,13 +126,13 @@ class Promotion:
         if self.champion_checkpoint is None:
             return
         ours, theirs = self.experiment.config, self.champion_checkpoint.manifest.config
-        own = {name: getattr(theirs.evaluation, name) for name in ("fine_tuning_steps", "learning_rate")}
+        fine_tuning = {name: getattr(theirs.evaluation, name) for name in ("fine_tuning_steps", "learning_rate")}
         config = theirs.model_copy(
             update={
                 "seed": ours.seed,  # names the episodes
                 "suite": ours.suite,
                 "demonstrations": ours.demonstrations,
-                "evaluation": ours.evaluation.model_copy(update=own),
+                "evaluation": ours.evaluation.model_copy(update=fine_tuning),
             }
         )
         Experiment(config, self.experiment.store).evaluate(runner, data, self.champion_checkpoint, self.folder)

@@ -92,12 +92,12 @@ class FinishedRun(EvaluationFolder):
     @cached_property
     def evaluations(self) -> dict[int, list[EpisodeResult]]:
         """The rows of each evaluation by its iteration: those on the way, and the one of the last checkpoint."""
-        found = {
+        on_the_way = {
             int(path.parent.name): read_rows(path, EpisodeResult)
             for path in sorted((self.folder / "evaluations").glob("*/episodes.jsonl"))
             if path.parent.name.isdecimal()
         }
-        return found if self.has_gone_on else found | {self.checkpoint.manifest.iteration: self.episodes}
+        return on_the_way if self.has_gone_on else on_the_way | {self.checkpoint.manifest.iteration: self.episodes}
 
     @property
     def best_score(self) -> int:

@@ -32,9 +32,9 @@ def status_of(recent: Sequence[Mapping[str, float]]) -> Status:
     """Return the losses and the use of sub-skills as means over some iterations' metrics."""
     if not recent:
         return Status()
-    shown = [name for name in recent[-1] if "loss" in name or name.startswith("sub_skill_share/")]
+    names = [name for name in recent[-1] if "loss" in name or name.startswith("sub_skill_share/")]
     # A method that learns in phases has other metrics in each.
-    means = {name: float(np.mean([metrics[name] for metrics in recent if name in metrics])) for name in shown}
+    means = {name: float(np.mean([metrics[name] for metrics in recent if name in metrics])) for name in names}
     losses = {name: value for name, value in means.items() if "loss" in name}
     return Status(losses=losses, shares=shares_of(means).tolist())
 

@@ -138,9 +138,9 @@ class Checkpoint:
             raise self._damaged(name, f"{tensors[odd[0]].dtype} in {shorten(odd[0])}", "float32 only")
         if shapes is None:
             return tensors
-        found = {key: tensor.shape for key, tensor in tensors.items()}
-        if found != {key: tuple(shape) for key, shape in shapes.items()}:
-            raise self._damaged(name, f"tensors {shorten(found)}", f"the manifest's {shorten(dict(shapes))}")
+        found_shapes = {key: tensor.shape for key, tensor in tensors.items()}
+        if found_shapes != {key: tuple(shape) for key, shape in shapes.items()}:
+            raise self._damaged(name, f"tensors {shorten(found_shapes)}", f"the manifest's {shorten(dict(shapes))}")
         return {key: tensors[key] for key in shapes}
 
     def _damaged(self, name: str, got: str, wanted: str) -> CheckpointError:
@@ -191,13 +191,13 @@ class Checkpoints:
         complaints: list[str] = []
         for path in reversed(paths):
             try:
-                found = Checkpoint(self._inside(path))
+                checkpoint = Checkpoint(self._inside(path))
             except CheckpointError as error:
                 complaints.append(" ".join(str(error).splitlines()))
             else:
                 if complaints:
                     logger.warning(f"{' | '.join(complaints)}; taking {path} instead")
-                return found
+                return checkpoint
         damaged = f"{len(paths)} checkpoints, none of them whole" if paths else "no checkpoint"
         raise CheckpointError("\n".join([f"{self.folder}: got {damaged}; wanted one; start the run anew", *complaints]))
 
@@ -254,13 +254,13 @@ class Checkpoints:
 
     def _sound(self) -> dict[Path, float | None]:
         """Return the loss of each checkpoint, oldest first, without those that a look at their files finds damaged."""
-        found: dict[Path, float | None] = {}
+        losses: dict[Path, float | None] = {}
         for path in self.all():
             try:
-                found[path] = _read_manifest(self._inside(path)).loss
+                losses[path] = _read_manifest(self._inside(path)).loss
             except CheckpointError:
                 continue
-        return found
+        return losses
 
     def _prune(self, needed: Collection[Path]) -> None:
         """Remove what is older than the newest `kept` whole checkpoints, damaged ones too, but not the best."""
@@ -289,9 +289,9 @@ def _read_manifest(path: Path) -> Manifest:
             f"{path / MANIFEST}: got {got}; wanted a checkpoint's manifest; use another checkpoint"
         ) from error
     for name, least in {PARAMETERS: 4 * manifest.size, OPTIMISER: 8 * manifest.size, CONSTANTS: 1}.items():
-        found = (path / name).stat().st_size if (path / name).is_file() else 0
-        if found < least:
-            raise CheckpointError(f"{path / name}: got {found} bytes; wanted at least {least}; use another checkpoint")
+        size = (path / name).stat().st_size if (path / name).is_file() else 0
+        if size < least:
+            raise CheckpointError(f"{path / name}: got {size} bytes; wanted at least {least}; use another checkpoint")
     return manifest
 
 

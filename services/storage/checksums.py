@@ -64,7 +64,7 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _compare(found: str, wanted: str | None, path: Path) -> None:
-    if found != wanted:
+def _compare(digest: str, wanted: str | None, path: Path) -> None:
+    if digest != wanted:
         listed = f"not {wanted[:12]} as listed" if wanted else "none is listed"
-        raise OSError(errno.EBADMSG, f"damaged: its SHA-256 is {found[:12]}, {listed}", str(path))
+        raise OSError(errno.EBADMSG, f"damaged: its SHA-256 is {digest[:12]}, {listed}", str(path))

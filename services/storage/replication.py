@@ -79,23 +79,23 @@ class Replica:
         newest = max(self._storage.committed(place, MARKER, NAMED), default="")
         if (self._folder / "config.json").exists() and newest <= max(here, default=""):
             return False
-        found = {name: self._storage.get(f"{self._name}/{name}", MOST_RECORDS) for name in RECORDS}
-        if found["config.json"] is None:
+        records = {name: self._storage.get(f"{self._name}/{name}", MOST_RECORDS) for name in RECORDS}
+        if records["config.json"] is None:
             return False
         self._folder.mkdir(parents=True, exist_ok=True)
         if newest:
             (self._folder / "checkpoints").mkdir(exist_ok=True)
             target = self._folder / "checkpoints" / newest
             self._storage.get_folder(f"{place}/{newest}", target, FILES, MARKER)
-        for name, content in found.items():
+        for name, content in records.items():
             if content is not None:
                 (self._folder / name).write_bytes(content)
         return True
 
 
 def _state(path: Path) -> tuple[float, int]:
-    found = path.stat()
-    return found.st_mtime, found.st_size
+    status = path.stat()
+    return status.st_mtime, status.st_size
 
 
 def restored(folder: Path) -> bool:

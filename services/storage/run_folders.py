@@ -16,7 +16,7 @@ def new_folder(name: str, runs: Path, mark: str) -> Path:
     """
     if name in (".", "..") or Path(name).name != name:
         raise UserError(f"--name: got {shorten(name)}; wanted the name of a folder in {runs}, without any /")
-    folder = _held(runs / name, runs, "--name")
+    folder = _inside_runs(runs / name, runs, "--name")
     if (folder / mark).exists():
         raise UserError(f"--name: got {folder}, which is taken; wanted a new name, or --resume {folder}")
     return folder
@@ -30,11 +30,11 @@ def find_folder(name: str, runs: Path, mark: str, flag: str = "--resume") -> Pat
     """
     for folder in (Path(name), runs / name):
         if (folder / mark).is_file():
-            return _held(folder, runs, flag)
+            return _inside_runs(folder, runs, flag)
     raise UserError(f"{flag}: got {shorten(name)}; wanted a folder with a {mark} in it, or the name of one in {runs}")
 
 
-def _held(folder: Path, runs: Path, flag: str) -> Path:
+def _inside_runs(folder: Path, runs: Path, flag: str) -> Path:
     """Return a folder, unless it seems to lie in `runs` and is a link that leads elsewhere.
 
     Raises:

@@ -80,13 +80,13 @@ def _check_attributes(suite: TaskSuite, where: str) -> None:
         UserError: names what is missing, or of another kind.
     """
     for attribute, kind in ATTRIBUTES.items():
-        found = getattr(suite, attribute, None)
-        if not isinstance(found, kind) or not found or (isinstance(found, int) and found < 1):
+        value = getattr(suite, attribute, None)
+        if not isinstance(value, kind) or not value or (isinstance(value, int) and value < 1):
             wanted = "an integer of at least 1" if kind is int else f"{kind.__name__}, not empty"
-            raise UserError(f"{where}: {attribute}: got {found!r}; wanted {wanted}; see {GUIDE}")
+            raise UserError(f"{where}: {attribute}: got {value!r}; wanted {wanted}; see {GUIDE}")
     for method in METHODS:
-        if not callable(found := getattr(suite, method, None)):
-            raise UserError(f"{where}: {method}: got {found!r}; wanted a method; see {GUIDE}")
+        if not callable(value := getattr(suite, method, None)):
+            raise UserError(f"{where}: {method}: got {value!r}; wanted a method; see {GUIDE}")
     named = [("family", suite.family), *(("tasks", task) for task in (*suite.train_tasks, *suite.test_tasks))]
     for attribute, name in named:
         if not isinstance(name, str) or not NAME.fullmatch(name):

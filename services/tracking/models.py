@@ -24,8 +24,8 @@ LIBRARIES = ("mlflow", "numpy", "torch")
 
 def models_of(client: "MlflowClient", run: "Run") -> "list[LoggedModel]":
     """Return the models of a run that are there as a whole, the newest first."""
-    found = client.search_logged_models([run.info.experiment_id], f"source_run_id = '{run.info.run_id}'")
-    return [model for model in found if model.status == "READY"]
+    models = client.search_logged_models([run.info.experiment_id], f"source_run_id = '{run.info.run_id}'")
+    return [model for model in models if model.status == "READY"]
 
 
 def checkpoint_in(model: Path) -> Path:

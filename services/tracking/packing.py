@@ -80,12 +80,12 @@ def _demonstration(fields: Any, number: int, obs_dim: int, action_dim: int) -> D
 
 def _numbers(numbers: Any, name: str, wanted: tuple[int, ...]) -> np.ndarray:
     """Return numbers of a shape, in which -1 stands for any length."""
-    in_words = f"{wanted[-1]} numbers" if len(wanted) == 1 else f"one row of {wanted[-1]} numbers for each step"
+    shape = f"{wanted[-1]} numbers" if len(wanted) == 1 else f"one row of {wanted[-1]} numbers for each step"
     try:
         rows = [np.asarray(row, np.float32) for row in numbers] if len(wanted) == 2 else numbers
-        found = np.asarray(rows, np.float32)
+        array = np.asarray(rows, np.float32)
     except (TypeError, ValueError) as error:
-        raise UserError(f"{name}: got {shorten(numbers)}; wanted {in_words}") from error
-    if found.ndim != len(wanted) or found.shape[-1] != wanted[-1]:
-        raise UserError(f"{name}: got the shape {found.shape}; wanted {in_words}")
-    return found
+        raise UserError(f"{name}: got {shorten(numbers)}; wanted {shape}") from error
+    if array.ndim != len(wanted) or array.shape[-1] != wanted[-1]:
+        raise UserError(f"{name}: got the shape {array.shape}; wanted {shape}")
+    return array

@@ -71,13 +71,13 @@ def high_level_gradient(high: Network, steps: Steps, targets: Targets, config: D
 
 def sub_skill_gradients(low: Sequence[Network], steps: Steps, chosen: Int[Tensor, " steps"]) -> dict[int, LossGradient]:
     """Return L_BC of each sub-skill on the states that the high level gave it, where there are any (equation 4)."""
-    own = own_states(chosen, len(low))
+    indices = own_states(chosen, len(low))
 
     def of(k: int) -> LossGradient:
-        actions = steps.actions[own[k]]
-        return loss_gradient(low[k], steps.states[own[k]], lambda p: behaviour_cloning_loss(p, actions))
+        actions = steps.actions[indices[k]]
+        return loss_gradient(low[k], steps.states[indices[k]], lambda p: behaviour_cloning_loss(p, actions))
 
-    return {k: of(k) for k in range(len(low)) if len(own[k])}
+    return {k: of(k) for k in range(len(low)) if len(indices[k])}
 
 
 def inner_loop(

@@ -77,11 +77,11 @@ class Mil(MetaLearner[MilConfig, MilBatch]):
         pairs = rng.choice(ends[-1], min(self.config.batch_pairs, int(ends[-1])), replace=False)
         owners = np.searchsorted(ends, pairs, side="right")
         steps = pairs - np.concatenate([[0], ends])[owners]
-        drawn = [(others[owner], step) for owner, step in zip(owners, steps, strict=True)]
+        query = [(others[owner], step) for owner, step in zip(owners, steps, strict=True)]
         return MilBatch(
             tuple(support),
-            np.stack([demonstration.observations[step] for demonstration, step in drawn]),
-            np.stack([demonstration.actions[step] for demonstration, step in drawn]),
+            np.stack([demonstration.observations[step] for demonstration, step in query]),
+            np.stack([demonstration.actions[step] for demonstration, step in query]),
             tuple(others[owner].id for owner in np.unique(owners)),
             int(rng.integers(2**63)),
         )

@@ -38,6 +38,6 @@ def draw_batch(
     order = torch.cat([torch.randperm(len(lengths), generator=generator) for _ in range(rounds)])
     before = lengths[order].cumsum(0) - lengths[order]
     order, before = order[before < size], before[before < size]
-    drawn = torch.minimum(lengths[order], size - before)
+    counts = torch.minimum(lengths[order], size - before)
     starts = (lengths.cumsum(0) - lengths)[order]
-    return (starts - before).repeat_interleave(drawn) + torch.arange(size), drawn
+    return (starts - before).repeat_interleave(counts) + torch.arange(size), counts

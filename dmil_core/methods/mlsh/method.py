@@ -63,8 +63,8 @@ class Mlsh(MetaLearner[MlshConfig, MlshBatch]):
         """
         if not demonstrations:
             raise DemonstrationError("demonstrations: got none for this task; wanted at least one; collect some first")
-        drawn = rng.permutation(len(demonstrations))[: self.config.trajectories]
-        return MlshBatch(tuple(demonstrations[index] for index in drawn), int(rng.integers(2**63)))
+        indices = rng.permutation(len(demonstrations))[: self.config.trajectories]
+        return MlshBatch(tuple(demonstrations[index] for index in indices), int(rng.integers(2**63)))
 
     def task_gradient(self, parameters: Parameters, batch: MlshBatch) -> TaskGradient:
         """Learn one task from its demonstrations and return how far the bank went, the other way round."""

@@ -76,8 +76,8 @@ class OptionExplorationPolicy(OptionPolicy):
         begun = zip(key.tolist(), step.tolist(), observations, strict=True)
         key = np.array([number if gone else _key(number, first) for number, gone, first in begun], np.int64)
         draws = [self._draw(*at) for at in zip(key.tolist(), step.tolist(), strict=True)]
-        uniform = torch.tensor([drawn for drawn, _ in draws])
-        noise = torch.from_numpy(np.array([drawn for _, drawn in draws], np.float32).reshape(len(draws), -1))
+        uniform = torch.tensor([number for number, _ in draws])
+        noise = torch.from_numpy(np.array([numbers for _, numbers in draws], np.float32).reshape(len(draws), -1))
 
         states = torch.from_numpy(self.normalise(observations))
         high = self.model.log_high(states)[torch.arange(len(states)), torch.from_numpy(last)].exp()

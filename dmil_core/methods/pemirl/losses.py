@@ -29,7 +29,7 @@ class Gaussian(NamedTuple):
 
     @classmethod
     def bounded(cls, mean: Float[Tensor, "rows size"], raw: Float[Tensor, "#rows size"]) -> "Gaussian":
-        """Return the one with log σ = 5 tanh(raw / 5), which is raw where that is small, and never without slope."""
+        """Return the one with log σ = 5 tanh(raw / 5), which is raw where that is small, and never without gradient."""
         return cls(mean, BOUND * torch.tanh(raw / BOUND))
 
     def log_density(self, values: Float[Tensor, "rows size"]) -> Float[Tensor, " rows"]:
@@ -177,7 +177,7 @@ class Losses(NamedTuple):
     """Trains θ and φ."""
     policy: Float[Tensor, ""]
     """Of the reward f − log π: trains ω."""
-    shown: dict[str, float]
+    metrics: dict[str, float]
 
 
 def losses_of(
@@ -199,12 +199,12 @@ def losses_of(
         generator: where m and the policy's actions are drawn from.
     """
     posterior = infer(parameters, contexts)
-    drawn = posterior.draw(generator)
-    groups = torch.arange(len(explained.lengths)) % len(drawn)
-    attached = explained.spread(drawn[groups])
+    draws = posterior.draw(generator)
+    groups = torch.arange(len(explained.lengths)) % len(draws)
+    attached = explained.spread(draws[groups])
     imitating = action_distribution(parameters, explained.states, attached)
 
-    # Without a slope for m from here on: only likelihood and divergence shape what m means.
+    # Without a gradient for m from here on: only likelihood and divergence shape what m means.
     context = attached.detach()
     acting = action_distribution(parameters, explained.states, context)
     actions = acting.draw(generator).detach()
@@ -214,8 +214,8 @@ def losses_of(
     pseudo_logits = f - log_probabilities.detach()
 
     if negatives == "mismatched":
-        shape = len(explained.lengths), drawn.shape[1]
-        other = explained.spread(torch.randn(shape, generator=generator, dtype=drawn.dtype))
+        shape = len(explained.lengths), draws.shape[1]
+        other = explained.spread(torch.randn(shape, generator=generator, dtype=draws.dtype))
         with torch.no_grad():
             mismatched = action_distribution(parameters, explained.states, other)
             log_mismatched = mismatched.log_density(mismatched.draw(generator))
@@ -223,10 +223,10 @@ def losses_of(
     else:
         negative_logits = pseudo_logits
 
-    log_posteriors = infer(parameters, explained._replace(actions=actions)).log_density(drawn.detach()[groups])
+    log_posteriors = infer(parameters, explained._replace(actions=actions)).log_density(draws.detach()[groups])
     returns = explained.averaged(reward[:, None]).squeeze(-1)
     with torch.no_grad():
-        shown = {
+        metrics = {
             "action_error": (acting.mean - explained.actions).square().sum(-1).mean().item(),
             "policy_deviation": acting.log_deviation.exp().mean().item(),
             "context_deviation": posterior.log_deviation.exp().mean().item(),
@@ -240,5 +240,5 @@ def losses_of(
         information_surrogate=information_surrogate(log_posteriors, returns, groups),
         discriminator=discriminator_loss(expert_logits, negative_logits),
         policy=policy_surrogate(log_probabilities, pseudo_logits),
-        shown=shown,
+        metrics=metrics,
     )

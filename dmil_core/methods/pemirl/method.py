@@ -50,11 +50,11 @@ class Pemirl(MetaLearner[PemirlConfig, ContextBatch]):
             "reward": [with_context, *of_reward, 1],
             "potential": [with_context, *of_reward, 1],
         }
-        drawn: dict[str, torch.Tensor] = {}
+        parameters: dict[str, torch.Tensor] = {}
         for prefix, units in sizes.items():
-            drawn |= initialise(prefix, units, rng, output_scale=config.output_scale)
+            parameters |= initialise(prefix, units, rng, output_scale=config.output_scale)
         raw = BOUND * math.atanh(math.log(config.initial_deviation) / BOUND)
-        return {**drawn, "log_deviation": torch.full((self.action_dim,), raw)}
+        return {**parameters, "log_deviation": torch.full((self.action_dim,), raw)}
 
     def sample(self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator) -> ContextBatch:
         """Draw the trajectories, all different where the task has as many, and name what is drawn later by a seed.
@@ -66,8 +66,8 @@ class Pemirl(MetaLearner[PemirlConfig, ContextBatch]):
             raise DemonstrationError("demonstrations: got none for this task; wanted at least one; collect some first")
         contexts, wanted = self.config.contexts, self.config.contexts + self.config.trajectories
         order = [rng.permutation(len(demonstrations)) for _ in range(-(-wanted // len(demonstrations)))]
-        drawn = [demonstrations[index] for index in np.concatenate(order)[:wanted]]
-        return ContextBatch(tuple(drawn[:contexts]), tuple(drawn[contexts:]), int(rng.integers(2**63)))
+        chosen = [demonstrations[index] for index in np.concatenate(order)[:wanted]]
+        return ContextBatch(tuple(chosen[:contexts]), tuple(chosen[contexts:]), int(rng.integers(2**63)))
 
     def task_gradient(self, parameters: Parameters, batch: ContextBatch) -> TaskGradient:
         """Return the gradient of the weighted sum of all losses."""
@@ -92,7 +92,7 @@ class Pemirl(MetaLearner[PemirlConfig, ContextBatch]):
             "context_divergence": losses.divergence.item(),
             "information_loss": losses.information.item(),
             "discriminator_loss": losses.discriminator.item(),
-            **losses.shown,
+            **losses.metrics,
         }
         return TaskGradient(flatten(dict(zip(free, gradients, strict=True))), metrics)
 

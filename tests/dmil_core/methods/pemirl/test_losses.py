@@ -335,4 +335,4 @@ def test_likelihood_is_that_of_actions_given_the_context_of_another_trajectory(
         total.append(policy.log_density(steps.actions))
         errors.append((policy.mean - steps.actions).square().sum(-1))
     assert found.likelihood.item() == pytest.approx(-torch.cat(total).mean().item(), abs=0.05)
-    assert found.shown["action_error"] == pytest.approx(torch.cat(errors).mean().item(), abs=0.05)
+    assert found.metrics["action_error"] == pytest.approx(torch.cat(errors).mean().item(), abs=0.05)
