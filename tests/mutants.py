@@ -108,7 +108,7 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
         "steps.sum(1, keepdims=True) > 0.1": "steps.sum(1, keepdims=True) > 0.5",
     },
     ("services/evaluation/comparison.py", "services/sweeps/test_tables.py"): {
-        '"yes, higher" if low > 0': '"yes, higher" if found.high > 0',
+        '"yes, higher" if low > 0': '"yes, higher" if high > 0',
     },
     ("services/cli/composition.py", "services/cli/test_arguments.py"): {
         "suite or named or DEFAULT_SUITE": "named or suite or DEFAULT_SUITE",
