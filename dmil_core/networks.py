@@ -143,6 +143,12 @@ def flatten(parameters: Parameters) -> Float[Tensor, " size"]:
     )
 
 
+def flat_gradient(loss: Float[Tensor, ""], parameters: Parameters) -> Float[Tensor, " size"]:
+    """Return the gradient of a loss with respect to leaves that it was computed from, flat as `flatten` has them."""
+    gradients = torch.autograd.grad(loss, tuple(parameters.values()))
+    return flatten(dict(zip(parameters, gradients, strict=True)))
+
+
 def unflatten(vector: Float[Tensor, " size"], like: Mapping[str, torch.Size]) -> Parameters:
     """Return views into `vector` with the names and shapes of `like`; the inverse of `flatten`."""
     pieces = vector.split([shape.numel() for shape in like.values()])

@@ -143,6 +143,20 @@ class Batch(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class DemonstrationBatch:
+    """Whole demonstrations of a task, as a `Batch`."""
+
+    demonstrations: tuple[Demonstration, ...]
+    seed: int
+    """Names all that is drawn in learning from them."""
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """The ids of the demonstrations."""
+        return tuple(demonstration.id for demonstration in self.demonstrations)
+
+
 BatchT = TypeVar("BatchT", bound=Batch)
 
 

@@ -52,8 +52,9 @@ def trajectory_advantages(
     lengths: Int[Tensor, " trajectories"],
     discount: float,
     trace: float,
+    last_values: Float[Tensor, " trajectories"] | None = None,
 ) -> Float[Tensor, " draws"]:
-    """Return the `generalised_advantages` within each trajectory, after whose end there is nothing: V = 0.
+    """Return the `generalised_advantages` within each trajectory.
 
     Args:
         rewards: of trajectories one after the other.
@@ -61,13 +62,15 @@ def trajectory_advantages(
         lengths: of the trajectories.
         discount: γ; with 0 they are r − V.
         trace: λ.
+        last_values: V of the states after each trajectory's last step; 0 if there is no going on.
     """
     if not discount:
         return rewards - values
     cuts = lengths.tolist()
+    ends = np.zeros(len(cuts)) if last_values is None else last_values.numpy()
     each = [
-        generalised_advantages(reward.numpy(), np.append(value.numpy(), 0.0), discount, trace)
-        for reward, value in zip(rewards.split(cuts), values.split(cuts), strict=True)
+        generalised_advantages(reward.numpy(), np.append(value.numpy(), end), discount, trace)
+        for reward, value, end in zip(rewards.split(cuts), values.split(cuts), ends, strict=True)
     ]
     return torch.from_numpy(np.concatenate(each)).to(rewards.dtype)
 

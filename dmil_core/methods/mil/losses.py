@@ -13,7 +13,7 @@ from dmil_core.losses import squared_errors
 from dmil_core.methods.base import FineTuning, TaskGradient
 from dmil_core.methods.mil.config import MilConfig
 from dmil_core.methods.mil.transformer import Dropout, cached, decode, dropout, encode, no_dropout, position_encoding
-from dmil_core.networks import Parameters, flatten, leaves
+from dmil_core.networks import Parameters, flat_gradient, leaves
 
 
 class Pairs(NamedTuple):
@@ -142,8 +142,7 @@ def outer_gradient(
     end = adapted(start, support, config, tuning, keep=second)
     with torch.enable_grad():
         loss = outer_loss(end.parameters, support, query, config, dropout(config.dropout, seed))
-    target = start if second else end.parameters
-    gradients = torch.autograd.grad(loss, tuple(target.values()))
+    gradient = flat_gradient(loss, start if second else end.parameters)
     with torch.no_grad():
         before = outer_loss(parameters, support, query, config, dropout(config.dropout, seed))
     assert end.loss is not None  # there is an inner step at least
@@ -153,7 +152,7 @@ def outer_gradient(
         "inner_loss": end.loss,
         "inner_clipped": end.clipped,
     }
-    return TaskGradient(flatten(dict(zip(target, gradients, strict=True))), metrics)
+    return TaskGradient(gradient, metrics)
 
 
 def _predictions(

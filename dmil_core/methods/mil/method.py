@@ -13,7 +13,7 @@ from dmil_core.methods.mil import transformer
 from dmil_core.methods.mil.config import MilConfig
 from dmil_core.methods.mil.losses import Pairs, Support, adapted, outer_gradient
 from dmil_core.methods.mil.policy import MilPolicy
-from dmil_core.methods.mil.transformer import Sizes, cached, encode
+from dmil_core.methods.mil.transformer import cached, encode
 from dmil_core.networks import Parameters, without_graph
 
 
@@ -43,19 +43,7 @@ class Mil(MetaLearner[MilConfig, MilBatch]):
 
     def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the transformer."""
-        config = self.config
-        sizes = Sizes(
-            self.obs_dim,
-            self.action_dim,
-            config.layers,
-            config.heads,
-            config.units,
-            config.key_units,
-            config.value_units,
-            config.feed_forward_units,
-            config.shots,
-        )
-        return transformer.initialise(sizes, rng, config.output_scale)
+        return transformer.initialise(self.config, self.obs_dim, self.action_dim, rng)
 
     def sample(self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator) -> MilBatch:
         """Draw one to `shots` demonstrations as the support set, and query pairs from all others.

@@ -14,7 +14,7 @@ parameters end in ``.weight`` for matrices, ``.bias`` for vectors, ``.scale`` an
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from dmil_core.methods.mil.config import MilConfig
 from dmil_core.networks import Parameters
 
 Dropout: TypeAlias = Callable[[Tensor], Tensor]
@@ -31,32 +32,14 @@ Cache: TypeAlias = tuple[tuple[Float[Tensor, "heads key_units tokens"], Float[Te
 """Keys and values of the encoder's output, for each layer of the decoder."""
 
 
-class Sizes(NamedTuple):
-    """What the shapes of all parameters follow from."""
-
-    obs_dim: int
-    action_dim: int
-    layers: int
-    """In the encoder, and as many in the decoder."""
-    heads: int
-    units: int
-    """Of each token, d_model."""
-    key_units: int
-    """Of each head, d_k."""
-    value_units: int
-    """Of each head, d_v."""
-    feed_forward_units: int
-    demonstrations: int
-    """How many are told apart."""
-
-
-def initialise(sizes: Sizes, rng: np.random.Generator, output_scale: float = 1.0) -> Parameters:
+def initialise(config: MilConfig, obs_dim: int, action_dim: int, rng: np.random.Generator) -> Parameters:
     """Draw the parameters: uniform weights that keep the variance (LeCun et al. 1998), zero biases, plain norms.
 
     Args:
-        sizes: of the transformer.
+        config: the sizes of all layers, and the scale of the output layer's weights against all others.
+        obs_dim: numbers in an observation.
+        action_dim: numbers in an action.
         rng: where the weights are drawn from.
-        output_scale: scale of the output layer's weights, against all others.
     """
     generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
     parameters: dict[str, Tensor] = {}
@@ -70,24 +53,24 @@ def initialise(sizes: Sizes, rng: np.random.Generator, output_scale: float = 1.0
     def norm(name: str) -> None:
         parameters[f"{name}.scale"], parameters[f"{name}.shift"] = torch.ones(units), torch.zeros(units)
 
-    units = sizes.units
-    weight("encoder.embedding", units, sizes.obs_dim + sizes.action_dim)
+    units = config.units
+    weight("encoder.embedding", units, obs_dim + action_dim)
     parameters["encoder.start.bias"] = torch.randn(units, generator=generator)
-    parameters["encoder.demonstration.weight"] = torch.randn(sizes.demonstrations, units, generator=generator)
-    weight("decoder.embedding", units, sizes.obs_dim)
+    parameters["encoder.demonstration.weight"] = torch.randn(config.shots, units, generator=generator)
+    weight("decoder.embedding", units, obs_dim)
     for part in ("encoder", "decoder"):
-        for layer in range(sizes.layers):
+        for layer in range(config.layers):
             prefix = f"{part}.{layer}"
             norm(f"{prefix}.attention.norm")
-            weight(f"{prefix}.attention.query", sizes.heads * sizes.key_units, units, bias=False)
-            weight(f"{prefix}.attention.key", sizes.heads * sizes.key_units, units, bias=False)
-            weight(f"{prefix}.attention.value", sizes.heads * sizes.value_units, units, bias=False)
-            weight(f"{prefix}.attention.output", units, sizes.heads * sizes.value_units, bias=False)
+            weight(f"{prefix}.attention.query", config.heads * config.key_units, units, bias=False)
+            weight(f"{prefix}.attention.key", config.heads * config.key_units, units, bias=False)
+            weight(f"{prefix}.attention.value", config.heads * config.value_units, units, bias=False)
+            weight(f"{prefix}.attention.output", units, config.heads * config.value_units, bias=False)
             norm(f"{prefix}.feed_forward.norm")
-            weight(f"{prefix}.feed_forward.0", sizes.feed_forward_units, units)
-            weight(f"{prefix}.feed_forward.1", units, sizes.feed_forward_units)
+            weight(f"{prefix}.feed_forward.0", config.feed_forward_units, units)
+            weight(f"{prefix}.feed_forward.1", units, config.feed_forward_units)
         norm(f"{part}.norm")
-    weight("output", sizes.action_dim, units, scale=output_scale)
+    weight("output", action_dim, units, scale=config.output_scale)
     return parameters
 
 

@@ -10,27 +10,13 @@ from torch import Tensor
 
 from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.losses import Steps, bank_errors, sub_skill_labels
-from dmil_core.methods.base import FineTuning, MetaLearner, TaskGradient
+from dmil_core.methods.base import DemonstrationBatch, FineTuning, MetaLearner, TaskGradient
 from dmil_core.methods.mlsh.config import MlshConfig
 from dmil_core.methods.mlsh.learning import FRESH_SCALE, Learner, TaskLearning, at_columns
 from dmil_core.methods.mlsh.macro_steps import macro_steps
 from dmil_core.methods.mlsh.policy import MlshPolicy
 from dmil_core.networks import Layer, Network, Parameters, bank, flatten, initialise, mlp, network, without_graph
 from dmil_core.seeding import named_rng
-
-
-@dataclass(frozen=True)
-class MlshBatch:
-    """What a sampled task is learned from."""
-
-    demonstrations: tuple[Demonstration, ...]
-    seed: int
-    """Names the fresh high level and all that is drawn in learning."""
-
-    @property
-    def ids(self) -> tuple[str, ...]:
-        """The ids of the demonstrations."""
-        return tuple(demonstration.id for demonstration in self.demonstrations)
 
 
 def _actors(parameters: Parameters) -> tuple[Network, ...]:
@@ -44,7 +30,7 @@ def _actors(parameters: Parameters) -> tuple[Network, ...]:
 
 
 @dataclass(frozen=True)
-class Mlsh(MetaLearner[MlshConfig, MlshBatch]):
+class Mlsh(MetaLearner[MlshConfig, DemonstrationBatch]):
     """MLSH for observations and actions of given sizes."""
 
     config_type = MlshConfig
@@ -55,7 +41,9 @@ class Mlsh(MetaLearner[MlshConfig, MlshBatch]):
         sizes = [self.obs_dim, *config.hidden, self.action_dim + 1]
         return initialise("low", sizes, rng, copies=config.sub_skills, output_scale=config.output_scale)
 
-    def sample(self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator) -> MlshBatch:
+    def sample(
+        self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator
+    ) -> DemonstrationBatch:
         """Draw whole demonstrations, without replacement.
 
         Raises:
@@ -64,9 +52,9 @@ class Mlsh(MetaLearner[MlshConfig, MlshBatch]):
         if not demonstrations:
             raise DemonstrationError("demonstrations: got none for this task; wanted at least one; collect some first")
         indices = rng.permutation(len(demonstrations))[: self.config.trajectories]
-        return MlshBatch(tuple(demonstrations[index] for index in indices), int(rng.integers(2**63)))
+        return DemonstrationBatch(tuple(demonstrations[index] for index in indices), int(rng.integers(2**63)))
 
-    def task_gradient(self, parameters: Parameters, batch: MlshBatch) -> TaskGradient:
+    def task_gradient(self, parameters: Parameters, batch: DemonstrationBatch) -> TaskGradient:
         """Learn one task from its demonstrations and return how far the bank went, the other way round."""
         config, steps = self.config, Steps.of(batch.demonstrations, self.normalise)
         high = self._fresh_high(np.random.default_rng(batch.seed), config.high_learning_rate)
@@ -89,11 +77,8 @@ class Mlsh(MetaLearner[MlshConfig, MlshBatch]):
 
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> MlshPolicy:
         """Learn a fresh high level on the support set, its steps being updates; the sub-skills stay as they are."""
-        steps, low, random = (
-            Steps.of(support, self.normalise),
-            _actors(parameters),
-            named_rng(0, "mlsh", "adapt"),
-        )
+        steps, low = Steps.of(support, self.normalise), _actors(parameters)
+        random = named_rng(0, "mlsh", "adapt")
         high = self._fresh_high(random, fine_tuning.learning_rate)
         task = TaskLearning(steps, self.config, torch.Generator().manual_seed(int(random.integers(2**63))))
         task.warm_up(high, bank_errors(low, steps), fine_tuning.steps)

@@ -17,7 +17,7 @@ from dmil_core.demonstrations import Normalisation
 from dmil_core.losses import Steps
 from dmil_core.methods.option_gail.config import OptionGailConfig
 from dmil_core.methods.option_gail.option_model import OptionModel, options_before
-from dmil_core.methods.ppo import clipped_surrogate, generalised_advantages
+from dmil_core.methods.ppo import clipped_surrogate, trajectory_advantages
 from dmil_core.networks import Parameters, descend, mlp, network
 from dmil_core.trajectories import Rollout
 
@@ -152,27 +152,20 @@ def ppo_targets(
     Values are of rewards less the round's mean. `beyond` is each trajectory's state after its last step, where both
     levels are valued by V_H: the next option is not yet drawn.
     """
-    ends = batch.steps.lengths.cumsum(0) - 1
-    last_values = high_values(parameters, beyond, batch.options[ends], config).numpy()
-    centred = (rewards - rewards.mean()).numpy()
-    cuts = (ends[:-1] + 1).tolist()
-
-    def advantages(values: np.ndarray) -> np.ndarray:
-        episodes = zip(np.split(centred, cuts), np.split(values, cuts), last_values, strict=True)
-        each = [
-            generalised_advantages(of, np.append(value, last), config.discount, config.smoothing)
-            for of, value, last in episodes
-        ]
-        return np.concatenate(each)
-
-    of_low = low_values(parameters, batch).numpy()
-    high = advantages(high_values(parameters, batch.steps.states, batch.before, config).numpy())
-    low = advantages(of_low)
-    return Targets(_standard(high), _standard(low), torch.from_numpy((low + of_low).astype(np.float32)))
+    lengths, centred = batch.steps.lengths, rewards - rewards.mean()
+    last_values = high_values(parameters, beyond, batch.options[lengths.cumsum(0) - 1], config)
+    of_low = low_values(parameters, batch)
+    of_high = high_values(parameters, batch.steps.states, batch.before, config)
+    high, low = (
+        trajectory_advantages(centred, values, lengths, config.discount, config.smoothing, last_values)
+        for values in (of_high, of_low)
+    )
+    return Targets(_standard(high), _standard(low), low + of_low)
 
 
-def _standard(values: np.ndarray) -> Float[Tensor, " steps"]:
-    return torch.from_numpy(((values - values.mean()) / (values.std() + 1e-8)).astype(np.float32))
+def _standard(values: Float[Tensor, " steps"]) -> Float[Tensor, " steps"]:
+    array = values.numpy()  # its sums round otherwise than torch's
+    return torch.from_numpy(((array - array.mean()) / (array.std() + 1e-8)).astype(np.float32))
 
 
 class Decisions(NamedTuple):

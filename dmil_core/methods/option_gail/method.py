@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dmil_core.demonstrations import Demonstration
 from dmil_core.losses import Steps
-from dmil_core.methods.base import FineTuning, MetaLearner, OnlineMetaLearner, TaskGradient
+from dmil_core.methods.base import DemonstrationBatch, FineTuning, MetaLearner, OnlineMetaLearner, TaskGradient
 from dmil_core.methods.option_gail.adversary import (
     POLICY,
     OptionSteps,
@@ -33,26 +33,18 @@ from dmil_core.methods.option_gail.option_model import (
     weighted_log_likelihood,
 )
 from dmil_core.methods.option_gail.policy import OptionExplorationPolicy, OptionPolicy
-from dmil_core.networks import Parameters, descend, flatten, initialise, leaves, without_graph
+from dmil_core.networks import Parameters, descend, flat_gradient, flatten, initialise, leaves, without_graph
 from dmil_core.trajectories import Rollout
 
 Phase = Literal["likelihood", "hard", "adversarial"]
 
 
 @dataclass(frozen=True)
-class OptionBatch:
+class OptionBatch(DemonstrationBatch):
     """Whole demonstrations of a task, what is done with them, and what came of acting."""
 
-    demonstrations: tuple[Demonstration, ...]
     phase: Phase
-    seed: int
-    """Names all that is drawn later."""
     rollouts: tuple[Rollout, ...] = ()
-
-    @property
-    def ids(self) -> tuple[str, ...]:
-        """The ids of the demonstrations."""
-        return tuple(demonstration.id for demonstration in self.demonstrations)
 
 
 class _EmLoss(NamedTuple):
@@ -91,7 +83,7 @@ class _Options(MetaLearner[Any, OptionBatch]):
         """Draw a slot's demonstrations, each at most once."""
         count = min(self.config.trajectories, len(demonstrations))
         chosen = rng.choice(len(demonstrations), count, replace=False)
-        return OptionBatch(tuple(demonstrations[index] for index in chosen), phase, int(rng.integers(2**63)))
+        return OptionBatch(tuple(demonstrations[index] for index in chosen), int(rng.integers(2**63)), phase)
 
     def _em_loss(self, parameters: Parameters, steps: Steps, phase: Phase) -> _EmLoss:
         """Return what EM goes down, per step: the E-step's weights are held fixed."""
@@ -128,8 +120,7 @@ class OptionGailOffline(_Options):
         """Return the gradient of −log p per step: of the actions, or of the actions and Viterbi's labels."""
         free = leaves(parameters)
         em = self._em_loss(free, Steps.of(batch.demonstrations, self.normalise), batch.phase)
-        gradients = torch.autograd.grad(em.loss, list(free.values()))
-        return TaskGradient(flatten(dict(zip(free, gradients, strict=True))), em.metrics)
+        return TaskGradient(flat_gradient(em.loss, free), em.metrics)
 
 
 class OptionGail(_Options, OnlineMetaLearner[Any, OptionBatch]):

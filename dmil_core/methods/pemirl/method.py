@@ -12,7 +12,7 @@ from dmil_core.methods.base import FineTuning, MetaLearner, TaskGradient
 from dmil_core.methods.behaviour_cloning.policy import NetworkPolicy
 from dmil_core.methods.pemirl.config import PemirlConfig
 from dmil_core.methods.pemirl.losses import BOUND, Transitions, infer, losses_of
-from dmil_core.networks import Layer, Parameters, flatten, initialise, leaves, network
+from dmil_core.networks import Layer, Parameters, flat_gradient, initialise, leaves, network
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,6 @@ class Pemirl(MetaLearner[PemirlConfig, ContextBatch]):
             + losses.discriminator
             + config.policy_weight * losses.policy
         )
-        gradients = torch.autograd.grad(total, list(free.values()))
         metrics = {
             "loss": total.item(),
             "likelihood_loss": losses.likelihood.item(),
@@ -94,7 +93,7 @@ class Pemirl(MetaLearner[PemirlConfig, ContextBatch]):
             "discriminator_loss": losses.discriminator.item(),
             **losses.metrics,
         }
-        return TaskGradient(flatten(dict(zip(free, gradients, strict=True))), metrics)
+        return TaskGradient(flat_gradient(total, free), metrics)
 
     def context(self, parameters: Parameters, support: Sequence[Demonstration]) -> torch.Tensor:
         """Return m of a support set: the mean of q_ψ's means over its demonstrations."""

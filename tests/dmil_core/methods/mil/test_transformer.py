@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dmil_core.methods.mil.config import MilConfig
 from dmil_core.methods.mil.transformer import (
-    Sizes,
     attention,
     cached,
     decode,
@@ -24,25 +24,23 @@ from dmil_core.methods.mil.transformer import (
 from dmil_core.networks import Parameters, flatten, unflatten
 from dmil_core.seeding import named_rng
 
-SIZES = Sizes(
-    obs_dim=5,
-    action_dim=3,
+CONFIG = MilConfig(
     layers=2,
     heads=2,
     units=12,
     key_units=6,
     value_units=6,
     feed_forward_units=10,
-    demonstrations=3,
+    output_scale=1.0,
 )
 
 
-def drawn(sizes: Sizes = SIZES, seed: int = 0) -> Parameters:
+def drawn(seed: int = 0) -> Parameters:
     """Draw all parameters, biases and norms too, so that nothing hides behind a zero or a one."""
     generator = torch.Generator().manual_seed(seed)
     return {
         name: (tensor + 0.3 * torch.randn(tensor.shape, generator=generator)).double()
-        for name, tensor in initialise(sizes, named_rng(seed, "initial")).items()
+        for name, tensor in initialise(CONFIG, 5, 3, named_rng(seed, "initial")).items()
     }
 
 
@@ -51,7 +49,7 @@ def random(*shape: int, seed: int = 0) -> Tensor:
 
 
 def steps(count: int, seed: int = 1) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    positions = position_encoding(torch.arange(count), SIZES.units).double()
+    positions = position_encoding(torch.arange(count), CONFIG.units).double()
     return random(count, 5, seed=seed), random(count, 3, seed=seed + 1), positions, torch.arange(count) % 3
 
 
@@ -64,14 +62,14 @@ def multihead(parameters: Parameters, prefix: str) -> dict[str, Tensor]:
     projections = [parameters[f"{prefix}.attention.{name}.weight"] for name in ("query", "key", "value")]
     return {
         "in_proj_weight": torch.cat(projections),
-        "in_proj_bias": torch.zeros(3 * SIZES.units).double(),
+        "in_proj_bias": torch.zeros(3 * CONFIG.units).double(),
         "out_proj.weight": parameters[f"{prefix}.attention.output.weight"],
-        "out_proj.bias": torch.zeros(SIZES.units).double(),
+        "out_proj.bias": torch.zeros(CONFIG.units).double(),
     }
 
 
 def norm(parameters: Parameters, name: str, values: Tensor) -> Tensor:
-    return functional.layer_norm(values, (SIZES.units,), parameters[f"{name}.scale"], parameters[f"{name}.shift"])
+    return functional.layer_norm(values, (CONFIG.units,), parameters[f"{name}.scale"], parameters[f"{name}.shift"])
 
 
 def embedded(parameters: Parameters, demonstrated: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
@@ -87,7 +85,7 @@ def embedded(parameters: Parameters, demonstrated: tuple[Tensor, Tensor, Tensor,
 def test_the_encoder_is_that_of_pytorch_with_normalisation_first() -> None:
     parameters, demonstrated = drawn(), steps(7)
     tokens = embedded(parameters, demonstrated)[None]
-    for layer in range(SIZES.layers):
+    for layer in range(CONFIG.layers):
         prefix = f"encoder.{layer}"
         values = {f"self_attn.{name}": value for name, value in multihead(parameters, prefix).items()}
         for theirs, ours in (("norm1", "attention.norm"), ("norm2", "feed_forward.norm")):
@@ -97,7 +95,7 @@ def test_the_encoder_is_that_of_pytorch_with_normalisation_first() -> None:
             }
         for theirs, ours in (("linear1", "feed_forward.0"), ("linear2", "feed_forward.1")):
             values |= {f"{theirs}.{part}": parameters[f"{prefix}.{ours}.{part}"] for part in ("weight", "bias")}
-        twin = nn.TransformerEncoderLayer(SIZES.units, 2, 10, 0.0, batch_first=True, norm_first=True).double()
+        twin = nn.TransformerEncoderLayer(CONFIG.units, 2, 10, 0.0, batch_first=True, norm_first=True).double()
         tokens = load(twin, values)(tokens)
     expected = norm(parameters, "encoder.norm", tokens[0])
     torch.testing.assert_close(encode(parameters, *demonstrated, 2), expected)
@@ -106,9 +104,9 @@ def test_the_encoder_is_that_of_pytorch_with_normalisation_first() -> None:
 def test_the_decoder_attends_to_the_encoder_alone() -> None:
     parameters, encoded, states = drawn(), random(8, 12), random(4, 5, seed=3)
     tokens = states @ parameters["decoder.embedding.weight"].T + parameters["decoder.embedding.bias"]
-    for layer in range(SIZES.layers):
+    for layer in range(CONFIG.layers):
         prefix = f"decoder.{layer}"
-        twin = load(nn.MultiheadAttention(SIZES.units, 2).double(), multihead(parameters, prefix))
+        twin = load(nn.MultiheadAttention(CONFIG.units, 2).double(), multihead(parameters, prefix))
         tokens = tokens + twin(norm(parameters, f"{prefix}.attention.norm", tokens), encoded, encoded)[0]
         hidden = (
             norm(parameters, f"{prefix}.feed_forward.norm", tokens) @ parameters[f"{prefix}.feed_forward.0.weight"].T
@@ -170,12 +168,12 @@ def test_every_part_of_a_layer_has_dropout(part: str) -> None:
 
     encoded = encode(parameters, *steps(4), 2, count if part == "encode" else no_dropout)
     decode(parameters, random(6, 5), cached(parameters, encoded, 2), count if part == "decode" else no_dropout)
-    assert calls == [(5 if part == "encode" else 6, 12)] * (1 + 2 * SIZES.layers)
+    assert calls == [(5 if part == "encode" else 6, 12)] * (1 + 2 * CONFIG.layers)
 
 
 def test_initial_parameters_survive_flattening_and_keep_the_variance() -> None:
-    sizes = SIZES._replace(units=64, feed_forward_units=256)
-    parameters = initialise(sizes, named_rng(0, "initial"), output_scale=0.5)
+    config = CONFIG.model_copy(update={"units": 64, "feed_forward_units": 256, "output_scale": 0.5})
+    parameters = initialise(config, 5, 3, named_rng(0, "initial"))
     back = unflatten(flatten(parameters), {name: tensor.shape for name, tensor in parameters.items()})
     assert all(torch.equal(back[name], tensor) for name, tensor in parameters.items())
     for name, tensor in parameters.items():
