@@ -1,8 +1,8 @@
-"""Few-shot adaptation and acting on one core: ours against the masked twin, at paper size.
+"""Few-shot adaptation and acting on one core: ours against the masked reference, at paper size.
 
 One demonstration of 100 steps, K = 3, width 512. An action reads the weights of the high level and of one sub-skill,
 which do not fit a core's own cache: the time that reading as many bytes takes, and nothing else, is its floor. MIL's
-action reads the decoder's weights and the encoder's view of the demonstration; it has no twin here.
+action reads the decoder's weights and the encoder's view of the demonstration; it has no reference here.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.harness import BenchmarkArguments, Row, alternate, lay_out, main
-from benchmarks.masked_twin import MaskedTwin
+from benchmarks.masked_reference import MaskedReference
 from benchmarks.workload import ACTION_DIM, OBS_DIM, as_in_a_run, draw_parameters, draw_steps, settings
 from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.methods.base import FineTuning
@@ -85,7 +85,7 @@ def _dmil(args: Arguments) -> list[Comparison]:
     parameters, support = draw_parameters(config), draw_steps(0, args.shots, 100)
     steps, rate = args.fine_tuning_steps, 1e-3
     config = config.model_copy(update={"inner_learning_rate": rate})
-    masked, hierarchy = MaskedTwin(config), Hierarchy.of(as_in_a_run(parameters))
+    masked, hierarchy = MaskedReference(config), Hierarchy.of(as_in_a_run(parameters))
 
     def ours() -> Hierarchy:
         return adapt(hierarchy, support, support, config, steps=steps)
@@ -95,7 +95,7 @@ def _dmil(args: Arguments) -> list[Comparison]:
 
     policy, adapted = DmilPolicy(ours(), Normalisation.identity(OBS_DIM)), of_masked()
     difference = max((policy.hierarchy.parameters[name] - adapted[name]).abs().max().item() for name in adapted)
-    assert difference < 1e-3, f"ours and the twin differ by {difference}"
+    assert difference < 1e-3, f"ours and the reference differ by {difference}"
     weights = torch.randn(sum(layer.weight.numel() for layer in (*hierarchy.high, *hierarchy.low[0])))
 
     def acting(states: int, target: float) -> Comparison:

@@ -1,9 +1,9 @@
-"""The meta-gradient against a masked twin in the plain style, and against the bare matrix products in it.
+"""The meta-gradient against a masked reference in the plain style, and against the bare matrix products in it.
 
-Three rivals take turns in one run. Ours computes the tasks on two single-threaded worker processes. The twin
-(benchmarks/masked_twin.py) computes them on two threads. The roofline repeats, on the same two workers, every matrix
-product that ours makes, on matrices of the same shapes and layouts, as many as ours and reused in the same order, so
-that the caches are as cold.
+Three rivals take turns in one run. Ours computes the tasks on two single-threaded worker processes. The reference
+(benchmarks/masked_reference.py) computes them on two threads. The roofline repeats, on the same two workers, every
+matrix product that ours makes, on matrices of the same shapes and layouts, as many as ours and reused in the same
+order, so that the caches are as cold.
 """
 
 import itertools
@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from benchmarks.harness import BenchmarkArguments, Row, alternate, lay_out, main
-from benchmarks.masked_twin import MaskedTwin
+from benchmarks.masked_reference import MaskedReference
 from benchmarks.workload import OBS_DIM, Size, as_in_a_run, draw_parameters, draw_sets, settings
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.dmil.meta_gradient import task_gradient
@@ -31,7 +31,7 @@ WORKERS = 2
 TASKS = {"paper": 2, "quick": 10}
 """Tasks in a batch; a worker computes an equal share of them."""
 TARGETS = {("paper", "second", 3): 2.2, ("paper", "second", 10): 4.3, ("quick", "first", 3): 3.0}
-"""Wanted: at least so many times the twin's speed."""
+"""Wanted: at least so many times the reference's speed."""
 ROOFLINE_TARGET = 0.85
 
 
@@ -160,7 +160,7 @@ def measure(size: Size, order: Literal["first", "second"], sub_skills: int, roun
     """Return the row of one configuration; seconds are those of one task."""
     config, tasks = settings(size, sub_skills, order), TASKS[size]
     parameters, sets = draw_parameters(config), [draw_sets(size, config, task) for task in range(tasks)]
-    masked = MaskedTwin(config)
+    masked = MaskedReference(config)
     ours = task_gradient(parameters, *sets[0], config).gradient
     error = ((ours - (plain := masked.gradient(parameters, sets[0])[0])).norm() / plain.norm()).item()
     with _workers(config, size) as everywhere:
@@ -230,7 +230,7 @@ def run(args: Arguments) -> Sequence[Row]:
         for size, order, k in plan:
             rows.append(measure(size, order, k, args.rounds))
             bar.advance(1, f"{size}, {order} order, K = {k}")
-    title = f"one task's meta-gradient: ours on {WORKERS} workers, the twin on {WORKERS} threads"
+    title = f"one task's meta-gradient: ours on {WORKERS} workers, the reference on {WORKERS} threads"
     console.print(lay_out(title, [_cells(row) for row in rows], words=2))
     return rows
 

@@ -5,7 +5,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 import torch
 
-from benchmarks.masked_twin import Sets
+from benchmarks.masked_reference import Sets
 from dmil_core.configs import PRESETS
 from dmil_core.demonstrations import Demonstration
 from dmil_core.losses import Steps

@@ -1,4 +1,4 @@
-"""What the tests of the science share: ragged trajectories, small networks and their twin."""
+"""What the tests of the science share: ragged trajectories, small networks and their reference."""
 
 from collections.abc import Callable, Iterator, Sequence
 

@@ -239,7 +239,7 @@ def test_any_network_and_loss(make_problem, plain_mlp, gradient_of, drawn: dict,
     assert float(other @ of_one) == pytest.approx(float(one @ of_other), rel=1e-10, abs=1e-10)
 
 
-def test_pull_back_is_linear_and_leaves_the_slope(problem, dtype) -> None:
+def test_pull_back_is_linear_and_leaves_the_gradient(problem, dtype) -> None:
     got, one, other = problem.gradient, normal_like(problem.network, 0), normal_like(problem.network, 1)
     blocks = itertools.chain(*got.inputs, *got.deltas)
     tensors = [*itertools.chain(*got.network), *blocks, got.outputs, got.loss.value, got.loss.gradient]
@@ -251,7 +251,7 @@ def test_pull_back_is_linear_and_leaves_the_slope(problem, dtype) -> None:
     assert all(map(torch.equal, tensors, before))
 
 
-def test_no_slope_changes_its_inputs_or_carries_a_graph(problem, gradient_of) -> None:
+def test_no_gradient_changes_its_inputs_or_carries_a_graph(problem, gradient_of) -> None:
     inputs, before = problem.inputs.clone(), flat(problem.network)
     got = problem.gradient
     hidden = itertools.chain(*(block[1:] for block in got.inputs), *got.deltas)
@@ -262,7 +262,7 @@ def test_no_slope_changes_its_inputs_or_carries_a_graph(problem, gradient_of) ->
     assert torch.equal(flat(problem.network), before)
 
 
-def test_units_that_never_fire_have_no_slope(make_problem, plain_mlp, gradient_of) -> None:
+def test_units_that_never_fire_have_no_gradient(make_problem, plain_mlp, gradient_of) -> None:
     """A ReLU at zero or below has derivative zero, as in torch: no gradient, no curvature, no NaN."""
     problem = make_problem(0, (6, 5), [8, 3], None)
     problem.network[0].weight[:2] = 0

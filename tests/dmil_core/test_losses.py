@@ -56,10 +56,10 @@ def test_repeating_the_states_of_a_sub_skill_changes_nothing() -> None:
 def test_behaviour_cloning_equals_its_formula_differentiated(steps: int, action_dim: int, seed: int) -> None:
     predictions, actions = normal(steps, action_dim, seed=seed), normal(steps, action_dim, seed=seed + 1)
     got = behaviour_cloning_loss(predictions, actions)
-    twin = differentiated(lambda outputs: ((outputs - actions) ** 2).sum(1).mean(), predictions)
+    reference = differentiated(lambda outputs: ((outputs - actions) ** 2).sum(1).mean(), predictions)
     direction = normal(steps, action_dim, seed=seed + 2)
-    torch.testing.assert_close(got[:2], twin[:2], rtol=1e-12, atol=1e-14)
-    torch.testing.assert_close(got.curvature(direction), twin.curvature(direction), rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(got[:2], reference[:2], rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(got.curvature(direction), reference.curvature(direction), rtol=1e-12, atol=1e-14)
 
 
 def test_steps_are_standardised_copies_in_order(make_demonstrations) -> None:

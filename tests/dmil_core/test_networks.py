@@ -152,8 +152,8 @@ def test_each_network_of_a_bank_equals_a_torch_module(networks: int) -> None:
 
 def test_activations_are_the_inputs_of_every_layer_then_the_outputs() -> None:
     parameters, inputs = drawn(), states(9)
-    twin, expected = module(pairs(parameters)), [inputs.clone()]
-    for index, layer in enumerate(twin):
+    reference, expected = module(pairs(parameters)), [inputs.clone()]
+    for index, layer in enumerate(reference):
         value = layer(expected[-1]).detach()
         expected = [*expected[:-1], value] if index % 2 else [*expected, value]
     values = activations(network(parameters, "net"), inputs)
@@ -167,18 +167,22 @@ def test_activations_are_the_inputs_of_every_layer_then_the_outputs() -> None:
 
 @pytest.mark.parametrize("steps", [7, BLOCK + 7])
 def test_mlp_can_be_differentiated(steps: int) -> None:
-    """Its ReLU works in place, which autograd must not notice; the twin's gradients do not go through it."""
+    """Its ReLU works in place, which autograd must not notice; the reference's gradients do not go through it."""
     parameters = {name: tensor.requires_grad_() for name, tensor in drawn().items()}
-    twin, inputs = module(pairs(parameters)), states(steps).requires_grad_()
+    reference, inputs = module(pairs(parameters)), states(steps).requires_grad_()
     got = torch.autograd.grad(
         mlp(network(parameters, "net"), inputs).square().sum() / steps,
         [inputs, *parameters.values()],
         create_graph=True,
     )
-    wanted = torch.autograd.grad(twin(inputs).square().sum() / steps, [inputs, *twin.parameters()], create_graph=True)
+    wanted = torch.autograd.grad(
+        reference(inputs).square().sum() / steps, [inputs, *reference.parameters()], create_graph=True
+    )
     torch.testing.assert_close(got, wanted, rtol=1e-4, atol=1e-5)
     (again,) = torch.autograd.grad(got[1].square().sum(), parameters["net.1.weight"])
-    (again_wanted,) = torch.autograd.grad(wanted[1].square().sum(), next(itertools.islice(twin.parameters(), 2, None)))
+    (again_wanted,) = torch.autograd.grad(
+        wanted[1].square().sum(), next(itertools.islice(reference.parameters(), 2, None))
+    )
     torch.testing.assert_close(again, again_wanted, rtol=1e-4, atol=1e-4)
 
 

@@ -59,7 +59,7 @@ def test_advantages_are_those_of_rllib() -> None:
 
 
 @pytest.mark.parametrize(
-    ("ratio", "advantage", "value", "slope"),
+    ("ratio", "advantage", "value", "derivative"),
     [
         (1.0, 2.0, 2.0, 2.0),
         (1.1, 2.0, 2.2, 2.0),
@@ -69,12 +69,14 @@ def test_advantages_are_those_of_rllib() -> None:
         (0.5, -2.0, -1.6, 0.0),
     ],
 )
-def test_the_surrogate_stops_rising_beyond_the_clip(ratio: float, advantage: float, value: float, slope: float) -> None:
+def test_the_surrogate_stops_rising_beyond_the_clip(
+    ratio: float, advantage: float, value: float, derivative: float
+) -> None:
     log_ratio = torch.tensor([ratio]).log().requires_grad_()
     found = clipped_surrogate(log_ratio, torch.tensor([advantage]), 0.2)
     assert found.item() == pytest.approx(value)
     (gradient,) = torch.autograd.grad(found, log_ratio)
-    assert gradient.item() == pytest.approx(slope * ratio)  # d ρ / d log ρ = ρ
+    assert gradient.item() == pytest.approx(derivative * ratio)  # d ρ / d log ρ = ρ
 
 
 def test_the_surrogate_is_the_mean_over_steps() -> None:

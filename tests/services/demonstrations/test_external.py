@@ -152,9 +152,9 @@ def test_what_does_not_fit_the_suite_is_told_with_its_episode(root: Path):
     metaworld = open_suite(SuiteConfig())
     with pytest.raises(DemonstrationError, match=r"slide\.npz: episode 0: observations: got 60 numbers a step; ml10 w"):
         demonstrations("reach", npz(root / "slide.npz"), metaworld, 10)
-    spoilt = OBSERVATIONS.copy()
-    spoilt[5, 3] = np.nan
-    place = hdf5(root / "a.hdf5", observations=spoilt)
+    not_finite = OBSERVATIONS.copy()
+    not_finite[5, 3] = np.nan
+    place = hdf5(root / "a.hdf5", observations=not_finite)
     with pytest.raises(DemonstrationError, match=r"a\.hdf5: episode 1: .*observations at step 1 is not finite"):
         demonstrations("slide", place, KITCHEN, 10)
     assert len(demonstrations("slide", place, KITCHEN, 1).demonstrations) == 1, "what is not used may be spoilt"

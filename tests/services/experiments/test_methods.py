@@ -37,7 +37,7 @@ from tests.services.distributed.courses import alone, assert_same_bits, follow, 
 
 PROJECT = Path(__file__).parents[3]
 LEARNERS = [name for name, kind in OURS.items() if issubclass(kind, MetaLearner)]
-PRACTISING = [name for name in LEARNERS if issubclass(OURS[name], OnlineMetaLearner)]
+ONLINE = [name for name in LEARNERS if issubclass(OURS[name], OnlineMetaLearner)]
 
 
 def smoke(method: str, iterations: int) -> ExperimentConfig:
@@ -56,7 +56,7 @@ def test_here_and_on_workers_that_are_killed_the_same_bits_come_out(store: DemoS
     assert np.isfinite(wanted.states[-1].parameters).all()
     assert any(map(np.not_equal, wanted.states[-1].parameters, wanted.states[0].parameters))
     steps = [slot.get("environment_steps", 0) for slots in wanted.slots for slot in slots]
-    assert any(steps) == (method in PRACTISING)
+    assert any(steps) == (method in ONLINE)
     with open_runner("ray", experiment.suite, 2) as runner:
         meta_training = runner.meta_train(plan_of(experiment, data))
         assert isinstance(meta_training, RayMetaTraining)
@@ -69,8 +69,8 @@ def test_here_and_on_workers_that_are_killed_the_same_bits_come_out(store: DemoS
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("method", PRACTISING)
-def test_a_killed_run_that_practises_goes_on_to_the_same_bits(programs, wait_for, workplace: Path, method: str):
+@pytest.mark.parametrize("method", ONLINE)
+def test_a_killed_online_run_goes_on_to_the_same_bits(programs, wait_for, workplace: Path, method: str):
     settings = ("--method", method, "--preset", "smoke", "--runner", "local", *QUICK_EVALUATION)
     begin = (*settings, "--training.checkpoint-every", "2")
     program = programs.start("meta_train", *begin, "--name", "killed", "--training.iterations", "100000")

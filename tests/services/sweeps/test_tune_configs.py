@@ -83,8 +83,8 @@ def test_each_sweep_ends_with_its_table(sweep, mlflow_file: str, name: str) -> N
         assert any("success_rate/" in metric for metric in child.data.metrics)
         if child.data.tags["method"] not in ("per-task", "nearest-neighbour"):
             assert "loss" in child.data.metrics
-    practised = {cell["row"] for cell in tables["cells"] if cell["environment_steps"]}
-    assert practised == {"OptionGAIL"} & set(ROWS[name])
+    online = {cell["row"] for cell in tables["cells"] if cell["environment_steps"]}
+    assert online == {"OptionGAIL"} & set(ROWS[name])
     flat = {cell["row"] for cell in tables["cells"] if cell["sub_skills_in_use"] is None}
     assert flat == FLAT & set(ROWS[name])
 

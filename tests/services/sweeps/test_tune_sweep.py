@@ -140,7 +140,7 @@ def test_a_trial_that_fails_or_dies_leaves_the_others_alone(
     programs, workplace: Path, mlflow_file: str, runs_of, wait_for
 ) -> None:
     """One has an error, which is told; one loses its process, and is begun again; trials of two CPUs each."""
-    variants = {"good": {}, "spoilt": {"training": {"learning_rate": 1e30}}}
+    variants = {"good": {}, "diverging": {"training": {"learning_rate": 1e30}}}
     file = write_sweep(variants, resources={"workers": 2})
     program = programs.start("tune_sweep", file, "--preset", "smoke", "--name", "hurt")
     folder = workplace / "runs" / "hurt"
@@ -155,7 +155,7 @@ def test_a_trial_that_fails_or_dies_leaves_the_others_alone(
     printed, _ = program.communicate()
     assert program.returncode == 1, printed
     assert "1 of 2 trials failed" in printed
-    assert "ml10-spoilt-seed-0: iteration" in printed
+    assert "ml10-diverging-seed-0: iteration" in printed
     assert "is not finite" in printed
     assert "Traceback" not in printed
     assert "its process ended; it is begun again" in printed
@@ -165,7 +165,7 @@ def test_a_trial_that_fails_or_dies_leaves_the_others_alone(
     _, children = runs_of(mlflow_file, folder)
     assert {child.data.tags["variant"]: child.info.status for child in children} == {
         "good": "FINISHED",
-        "spoilt": "FAILED",
+        "diverging": "FAILED",
     }
     assert "is not finite" in next(child.data.tags["error"] for child in children if child.info.status == "FAILED")
 

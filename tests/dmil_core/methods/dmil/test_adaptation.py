@@ -1,4 +1,4 @@
-"""The dual inner loop: one step by hand, many against a plain twin, and what it must leave alone."""
+"""The dual inner loop: one step by hand, many against a plain reference, and what it must leave alone."""
 
 import itertools
 
@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional
 
-from benchmarks.masked_twin import MaskedTwin
+from benchmarks.masked_reference import MaskedReference
 from dmil_core.losses import Steps, bank_errors, sub_skill_labels
 from dmil_core.methods.dmil.adaptation import (
     Hierarchy,
@@ -57,7 +57,7 @@ def losses(step: InnerStep) -> list[torch.Tensor]:
     return [step.high.loss.value, *(step.low[k].loss.value for k in sorted(step.low))]
 
 
-class Twin:
+class Reference:
     """The dual inner loop in plain autograd on whole banks, with masks; every label is worked out anew."""
 
     def __init__(self, parameters: Parameters, learning_rate: float, continuity_weight: float) -> None:
@@ -183,7 +183,7 @@ def test_keeping_the_networks_changes_no_bit(make_parameters, make_steps, seed: 
         assert flat(one.adapted).isfinite().all()
 
 
-def test_kept_slopes_hold_the_networks_of_their_own_step(hierarchy, support) -> None:
+def test_kept_gradients_hold_the_networks_of_their_own_step(hierarchy, support) -> None:
     path: list[InnerStep] = []
     arrived = [flat(hierarchy)]
     for step in itertools.islice(inner_loop(hierarchy, *support, config=CONFIG, keep=True), 5):
@@ -250,18 +250,18 @@ def test_one_step_is_that_of_algorithm_1(parameters, hierarchy, support, plain_m
 
 @pytest.mark.parametrize("keep", [False, True])
 @pytest.mark.parametrize("sub_skills", [1, 2, 4, 8])
-def test_many_steps_equal_a_twin_that_labels_everything_anew(
+def test_many_steps_equal_a_reference_that_labels_everything_anew(
     make_parameters, make_steps, sub_skills: int, keep: bool
 ) -> None:
     parameters, count = make_parameters(1, sub_skills), 12
     support = make_steps(1, [5, 1, 7]), make_steps(2, [3, 4])
-    twin, seen, used = Twin(parameters, CONFIG.inner_learning_rate, CONFIG.continuity_weight), [], []
+    reference, seen, used = Reference(parameters, CONFIG.inner_learning_rate, CONFIG.continuity_weight), [], []
     for step in itertools.islice(inner_loop(Hierarchy.of(parameters), *support, config=CONFIG, keep=keep), count):
-        labels, high, chosen, low = twin.step(*support)
+        labels, high, chosen, low = reference.step(*support)
         assert step.high.loss.value.item() == pytest.approx(high, rel=1e-9, abs=1e-12)
         assert set(step.low) == set(chosen)
         assert sum(of_low.loss.value.item() for of_low in step.low.values()) == pytest.approx(low, rel=1e-9)
-        expected = {name: tensor.detach() for name, tensor in twin.tensors.items()}
+        expected = {name: tensor.detach() for name, tensor in reference.tensors.items()}
         torch.testing.assert_close(step.adapted.parameters, expected, rtol=1e-9, atol=1e-11)
         seen.append(labels)
         used.append(set(chosen))
@@ -272,7 +272,7 @@ def test_many_steps_equal_a_twin_that_labels_everything_anew(
             "a label must come from a sub-skill that the step before left alone"
         )
     adapted = adapt(Hierarchy.of(parameters), *support, config=CONFIG, steps=count)
-    expected = {name: tensor.detach() for name, tensor in twin.tensors.items()}
+    expected = {name: tensor.detach() for name, tensor in reference.tensors.items()}
     torch.testing.assert_close(adapted.parameters, expected, rtol=1e-9, atol=1e-11)
 
 
@@ -281,9 +281,9 @@ def test_many_steps_equal_a_twin_that_labels_everything_anew(
 def test_labels_follow_the_sub_skills_of_their_step(make_parameters, make_steps, seed: int, sub_skills: int) -> None:
     """Of sub-skills that come and go: each step's L_h is that of labels from scratch."""
     parameters, support = make_parameters(seed, sub_skills), (make_steps(seed, [4, 1]), make_steps(seed + 1, [3]))
-    twin = Twin(parameters, CONFIG.inner_learning_rate, CONFIG.continuity_weight)
+    reference = Reference(parameters, CONFIG.inner_learning_rate, CONFIG.continuity_weight)
     for step in itertools.islice(inner_loop(Hierarchy.of(parameters), *support, config=CONFIG), 4):
-        _, high, chosen, low = twin.step(*support)
+        _, high, chosen, low = reference.step(*support)
         assert step.high.loss.value.item() == pytest.approx(high, rel=1e-7, abs=1e-9)
         assert set(step.low) == set(chosen)
         assert sum(of_low.loss.value.item() for of_low in step.low.values()) == pytest.approx(low, rel=1e-7)
@@ -384,9 +384,9 @@ def test_a_level_that_is_not_adapted_stays_bit_for_bit(parameters, support, adap
 
 @pytest.mark.parametrize("em", ["soft", "reference_soft"])
 @pytest.mark.parametrize("adapted", ["both", "high", "low"])
-def test_variants_adapt_as_the_plain_twin(make_parameters, make_steps, adapted: str, em: str) -> None:
+def test_variants_adapt_as_the_plain_reference(make_parameters, make_steps, adapted: str, em: str) -> None:
     parameters, support = make_parameters(2, 3), make_steps(1, [5, 1, 7])
     config = DmilConfig.model_validate({"inner_learning_rate": 0.1, "adapted": adapted, "em": em})
     got = adapt(Hierarchy.of(parameters), support, support, config, steps=4).parameters
-    wanted = MaskedTwin(config).adapt(parameters, support, 4, 0.1)
+    wanted = MaskedReference(config).adapt(parameters, support, 4, 0.1)
     torch.testing.assert_close(got, {name: wanted[name].detach() for name in got}, rtol=1e-10, atol=1e-12)

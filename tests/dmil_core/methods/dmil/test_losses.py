@@ -174,9 +174,9 @@ def test_cross_entropy_to_soft_labels_equals_autograd(transposed: bool) -> None:
     logits, direction = normal(5, SUB_SKILLS, seed=3), normal(5, SUB_SKILLS, seed=4)
     labels = soft_labels(normal(SUB_SKILLS, 5).square(), 1.0, transposed=transposed)
     got = cross_entropy(logits, labels)
-    twin = differentiated(lambda outputs: -(labels * outputs.log_softmax(-1)).sum(1).mean(), logits)
-    torch.testing.assert_close(got[:2], twin[:2], rtol=1e-12, atol=1e-14)
-    torch.testing.assert_close(got.curvature(direction), twin.curvature(direction), rtol=1e-12, atol=1e-14)
+    reference = differentiated(lambda outputs: -(labels * outputs.log_softmax(-1)).sum(1).mean(), logits)
+    torch.testing.assert_close(got[:2], reference[:2], rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(got.curvature(direction), reference.curvature(direction), rtol=1e-12, atol=1e-14)
 
 
 def test_cross_entropy_to_certain_soft_labels_is_that_to_the_labels() -> None:

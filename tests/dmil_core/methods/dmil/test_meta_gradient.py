@@ -1,4 +1,4 @@
-"""The outer gradient against a plain twin and against finite differences, and the tree that adds gradients."""
+"""The outer gradient against a plain reference and against finite differences, and the tree that adds gradients."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.nn import functional
 
-from benchmarks.masked_twin import MaskedTwin, Sets
+from benchmarks.masked_reference import MaskedReference, Sets
 from dmil_core.losses import Steps
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.dmil.meta_gradient import task_gradient
@@ -43,14 +43,14 @@ def sets(make_steps) -> Sets:
 @pytest.mark.parametrize("order", ["first", "second"])
 @pytest.mark.parametrize(("inner_steps", "continuity_weight"), [(1, 0.5), (2, 0.0), (3, 0.1), (3, 0.0)])
 @pytest.mark.parametrize("sub_skills", [1, 2, 3, 5, 8, 10])
-def test_equals_the_plain_twin(
+def test_equals_the_plain_reference(
     make_parameters, make_steps, sub_skills, inner_steps, continuity_weight, order, dtype
 ) -> None:
     config = settings(sub_skills, inner_steps=inner_steps, continuity_weight=continuity_weight, order=order)
     parameters = make_parameters(sub_skills, sub_skills, dtype=dtype)
     sets = draw_sets(make_steps, dtype)
     got = task_gradient(parameters, *sets, config)
-    gradient, high, low = MaskedTwin(config).gradient(parameters, sets)
+    gradient, high, low = MaskedReference(config).gradient(parameters, sets)
     assert got.gradient.dtype == dtype
     assert relative_error(got.gradient, gradient) <= TOLERANCE[dtype]
     assert got.metrics["high_loss_after"] == pytest.approx(high, rel=TOLERANCE[dtype], abs=TOLERANCE[dtype])
@@ -61,12 +61,15 @@ def test_equals_the_plain_twin(
 @pytest.mark.parametrize("continuity", ["expected", "reference"])
 @pytest.mark.parametrize("em", ["hard", "soft", "reference_soft"])
 @pytest.mark.parametrize("adapted", ["both", "high", "low"])
-def test_every_variant_equals_the_plain_twin(make_parameters, sets: Sets, adapted, em, continuity, order) -> None:
+def test_every_variant_equals_the_plain_reference(make_parameters, sets: Sets, adapted, em, continuity, order) -> None:
     config = settings(
         3, inner_steps=2, adapted=adapted, em=em, continuity=continuity, order=order, posterior_deviation=1.5
     )
     parameters = make_parameters(0, 3)
-    got, (gradient, high, low) = task_gradient(parameters, *sets, config), MaskedTwin(config).gradient(parameters, sets)
+    got, (gradient, high, low) = (
+        task_gradient(parameters, *sets, config),
+        MaskedReference(config).gradient(parameters, sets),
+    )
     assert relative_error(got.gradient, gradient) <= 1e-10
     assert got.metrics["high_loss_after"] == pytest.approx(high, rel=1e-10)
     assert got.metrics["low_loss_after"] == pytest.approx(low, rel=1e-10)
@@ -92,20 +95,26 @@ def test_the_reference_continuity_loss_has_no_gradient(make_parameters, sets: Se
 @pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
 @pytest.mark.parametrize("order", ["first", "second"])
 @pytest.mark.parametrize("hidden", [(), (8,), (9, 6, 7, 8)], ids=lambda hidden: f"{len(hidden)} hidden")
-def test_equals_the_plain_twin_at_any_depth(make_parameters, make_steps, hidden, order, dtype) -> None:
+def test_equals_the_plain_reference_at_any_depth(make_parameters, make_steps, hidden, order, dtype) -> None:
     config, parameters = settings(3, inner_steps=3, order=order), make_parameters(0, 3, hidden, dtype)
     sets = draw_sets(make_steps, dtype)
-    got, wanted = task_gradient(parameters, *sets, config).gradient, MaskedTwin(config).gradient(parameters, sets)[0]
+    got, wanted = (
+        task_gradient(parameters, *sets, config).gradient,
+        MaskedReference(config).gradient(parameters, sets)[0],
+    )
     assert relative_error(got, wanted) <= TOLERANCE[dtype]
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
 @pytest.mark.parametrize("order", ["first", "second"])
-def test_equals_the_plain_twin_on_several_blocks_of_steps(make_parameters, make_steps, order, dtype) -> None:
+def test_equals_the_plain_reference_on_several_blocks_of_steps(make_parameters, make_steps, order, dtype) -> None:
     config, parameters = settings(3, inner_steps=2, order=order), make_parameters(0, 3, dtype=dtype)
     one, two, three, four = (make_steps(seed, [BLOCK // 2, 2 * BLOCK + seed], dtype) for seed in range(4))
     got = task_gradient(parameters, one, two, three, four, config).gradient
-    assert relative_error(got, MaskedTwin(config).gradient(parameters, (one, two, three, four))[0]) <= TOLERANCE[dtype]
+    assert (
+        relative_error(got, MaskedReference(config).gradient(parameters, (one, two, three, four))[0])
+        <= TOLERANCE[dtype]
+    )
 
 
 @given(
@@ -115,13 +124,13 @@ def test_equals_the_plain_twin_on_several_blocks_of_steps(make_parameters, make_
     inner_steps=st.integers(1, 4),
     order=st.sampled_from(["first", "second"]),
 )
-def test_equals_the_plain_twin_on_few_states(
+def test_equals_the_plain_reference_on_few_states(
     make_parameters, make_steps, seed, sub_skills, lengths, inner_steps, order
 ) -> None:
     """Sub-skills are left without states in some of the inner steps, in the outer one, or in all."""
     config, parameters = settings(sub_skills, inner_steps=inner_steps, order=order), make_parameters(seed, sub_skills)
     one, two, three, four = (make_steps(seed + index, own) for index, own in enumerate(lengths))
-    gradient, high, low = MaskedTwin(config).gradient(parameters, (one, two, three, four))
+    gradient, high, low = MaskedReference(config).gradient(parameters, (one, two, three, four))
     got = task_gradient(parameters, one, two, three, four, config)
     torch.testing.assert_close(got.gradient, gradient, rtol=1e-9, atol=1e-10)
     assert got.metrics["high_loss_after"] == pytest.approx(high, rel=1e-9, abs=1e-10)
@@ -131,14 +140,14 @@ def test_equals_the_plain_twin_on_few_states(
 @pytest.mark.parametrize("order", ["first", "second"])
 @pytest.mark.parametrize("continuity_weight", [0.0, 0.5])
 @pytest.mark.parametrize("sub_skills", [2, 5])
-def test_equals_the_plain_twin_where_only_the_last_sub_skill_is_used(
+def test_equals_the_plain_reference_where_only_the_last_sub_skill_is_used(
     make_parameters, sets: Sets, sub_skills, continuity_weight, order
 ) -> None:
     parameters = make_parameters(0, sub_skills)
     parameters["high.2.bias"][-1] += 8
     config = settings(sub_skills, continuity_weight=continuity_weight, order=order)
     got = task_gradient(parameters, *sets, config)
-    assert relative_error(got.gradient, MaskedTwin(config).gradient(parameters, sets)[0]) <= 1e-10
+    assert relative_error(got.gradient, MaskedReference(config).gradient(parameters, sets)[0]) <= 1e-10
     assert got.metrics[f"sub_skill_share/{sub_skills - 1}"] == 1
     unused = unflatten(got.gradient, {name: tensor.shape for name, tensor in parameters.items()})["low.0.weight"][:-1]
     assert torch.equal(unused, torch.zeros_like(unused))

@@ -1,4 +1,4 @@
-"""MIL's losses, of which nothing can be copied in the inner one, and its gradients against plain twins."""
+"""MIL's losses, of which nothing can be copied in the inner one, and its gradients against plain references."""
 
 from typing import Any, Literal
 
@@ -139,7 +139,7 @@ def test_only_what_is_not_hidden_can_be_copied() -> None:
 
 @pytest.mark.parametrize("order", ["first", "second"])
 @pytest.mark.parametrize("steps", [1, 2])
-def test_the_outer_gradient_is_that_of_a_plain_twin(
+def test_the_outer_gradient_is_that_of_a_plain_reference(
     parameters, make_demonstrations, order: Literal["first", "second"], steps: int
 ) -> None:
     config = SMALL_MIL.model_copy(update={"order": order, "inner_steps": steps, "dropout": 0.0, "inner_clip": None})
@@ -147,8 +147,8 @@ def test_the_outer_gradient_is_that_of_a_plain_twin(
     start, query = precise(parameters), double(query)
     fast = start
     for _ in range(steps):
-        slopes = torch.autograd.grad(inner_loss(fast, support, config), list(fast.values()), create_graph=True)
-        fast = {name: fast[name] - 0.05 * slope for name, slope in zip(fast, slopes, strict=True)}
+        gradients = torch.autograd.grad(inner_loss(fast, support, config), list(fast.values()), create_graph=True)
+        fast = {name: fast[name] - 0.05 * gradient for name, gradient in zip(fast, gradients, strict=True)}
     loss = outer_loss(fast, support, query, config)
     of = start if order == "second" else fast
     expected = dict(zip(of, torch.autograd.grad(loss, list(of.values())), strict=True))
@@ -161,7 +161,7 @@ def test_the_outer_gradient_is_that_of_a_plain_twin(
 
 @pytest.mark.parametrize("clip", [None, 0.05])
 def test_the_second_order_gradient_against_finite_differences(parameters, make_demonstrations, clip) -> None:
-    """With dropout, which is the same at both ends; clipped numbers have no slope, and some are clipped."""
+    """With dropout, which is the same at both ends; clipped numbers have no gradient, and some are clipped."""
     config = SMALL_MIL.model_copy(update={"inner_clip": clip})
     support = double(support_of(make_demonstrations(0, [5, 4])))
     query, start = double(pairs_of(make_demonstrations(1, [6])[0])), precise(parameters)
@@ -175,8 +175,8 @@ def test_the_second_order_gradient_against_finite_differences(parameters, make_d
             outer_gradient(unflatten(vector + step * direction, shapes), support, query, config, 3).metrics["loss"]
             for step in (1e-6, -1e-6)
         ]
-        slope = (found.gradient @ direction).item()
-        assert (ends[0] - ends[1]) / 2e-6 == pytest.approx(slope, rel=1e-4, abs=1e-6)
+        gradient = (found.gradient @ direction).item()
+        assert (ends[0] - ends[1]) / 2e-6 == pytest.approx(gradient, rel=1e-4, abs=1e-6)
 
 
 def test_the_inner_gradient_is_clipped_number_by_number(parameters, make_demonstrations) -> None:

@@ -155,8 +155,10 @@ def test_adaptation_is_the_inner_loop(method, parameters, demonstrations, steps:
     expected = dict(parameters)
     for _ in range(steps):
         leaves = {name: tensor.detach().requires_grad_() for name, tensor in expected.items()}
-        slopes = torch.autograd.grad(inner_loss(leaves, support, SMALL_MIL), list(leaves.values()))
-        expected = {name: leaves[name].detach() - 0.1 * slope for name, slope in zip(leaves, slopes, strict=True)}
+        gradients = torch.autograd.grad(inner_loss(leaves, support, SMALL_MIL), list(leaves.values()))
+        expected = {
+            name: leaves[name].detach() - 0.1 * gradient for name, gradient in zip(leaves, gradients, strict=True)
+        }
     torch.testing.assert_close(flatten(policy.parameters), flatten(expected))
     assert torch.equal(flatten(policy.parameters), before) == (steps == 0)
     cache = cached(expected, encode(expected, *support, 2), 2)

@@ -95,8 +95,8 @@ def test_the_encoder_is_that_of_pytorch_with_normalisation_first() -> None:
             }
         for theirs, ours in (("linear1", "feed_forward.0"), ("linear2", "feed_forward.1")):
             values |= {f"{theirs}.{part}": parameters[f"{prefix}.{ours}.{part}"] for part in ("weight", "bias")}
-        twin = nn.TransformerEncoderLayer(CONFIG.units, 2, 10, 0.0, batch_first=True, norm_first=True).double()
-        tokens = load(twin, values)(tokens)
+        reference = nn.TransformerEncoderLayer(CONFIG.units, 2, 10, 0.0, batch_first=True, norm_first=True).double()
+        tokens = load(reference, values)(tokens)
     expected = norm(parameters, "encoder.norm", tokens[0])
     torch.testing.assert_close(encode(parameters, *demonstrated, 2), expected)
 
@@ -106,8 +106,8 @@ def test_the_decoder_attends_to_the_encoder_alone() -> None:
     tokens = states @ parameters["decoder.embedding.weight"].T + parameters["decoder.embedding.bias"]
     for layer in range(CONFIG.layers):
         prefix = f"decoder.{layer}"
-        twin = load(nn.MultiheadAttention(CONFIG.units, 2).double(), multihead(parameters, prefix))
-        tokens = tokens + twin(norm(parameters, f"{prefix}.attention.norm", tokens), encoded, encoded)[0]
+        reference = load(nn.MultiheadAttention(CONFIG.units, 2).double(), multihead(parameters, prefix))
+        tokens = tokens + reference(norm(parameters, f"{prefix}.attention.norm", tokens), encoded, encoded)[0]
         hidden = (
             norm(parameters, f"{prefix}.feed_forward.norm", tokens) @ parameters[f"{prefix}.feed_forward.0.weight"].T
         )

@@ -149,15 +149,15 @@ def test_an_offline_slot_goes_one_step_of_adam(offline, playing, demonstrations,
     parameters = drawn_parameters(playing)
     batch = playing.sample(demonstrations, iteration, named_rng(0, "batch"))
     model = {name: tensor for name, tensor in parameters.items() if not name.startswith(("critic", "discriminator"))}
-    slopes = like(offline.task_gradient(model, batch).gradient, model)
+    gradients = like(offline.task_gradient(model, batch).gradient, model)
     found = playing.task_gradient(parameters, batch)
     for name, way in like(found.gradient, parameters).items():
-        slope = slopes.get(name)
-        if slope is None:
+        gradient = gradients.get(name)
+        if gradient is None:
             assert not way.any()
         else:  # Adam's first step
             torch.testing.assert_close(
-                way, PLAYING.offline_learning_rate * slope / (slope.abs() + 1e-8), rtol=1e-2, atol=1e-6
+                way, PLAYING.offline_learning_rate * gradient / (gradient.abs() + 1e-8), rtol=1e-2, atol=1e-6
             )
 
 

@@ -94,10 +94,10 @@ def gradients(loss: Tensor, leaves: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def test_density_and_divergence_are_the_normal_distributions(make_steps) -> None:
     values, others = make_steps(0, [6])[:2]
     gaussian = Gaussian(others, values[:, :3] / 2)
-    twin = torch.distributions.Normal(gaussian.mean, gaussian.log_deviation.exp())
-    torch.testing.assert_close(gaussian.log_density(values[:, 1:]), twin.log_prob(values[:, 1:]).sum(-1))
+    reference = torch.distributions.Normal(gaussian.mean, gaussian.log_deviation.exp())
+    torch.testing.assert_close(gaussian.log_density(values[:, 1:]), reference.log_prob(values[:, 1:]).sum(-1))
     standard = torch.distributions.Normal(torch.zeros(3), torch.ones(3))
-    expected = torch.distributions.kl_divergence(twin, standard).sum(-1)
+    expected = torch.distributions.kl_divergence(reference, standard).sum(-1)
     torch.testing.assert_close(gaussian.divergence(), expected)
 
 
@@ -108,22 +108,22 @@ def test_one_log_deviation_serves_all_rows(make_steps) -> None:
     assert torch.equal(shared.log_density(values), each.log_density(values))
 
 
-def test_deviations_are_bounded_and_keep_a_slope() -> None:
+def test_deviations_are_bounded_and_keep_a_gradient() -> None:
     raw = torch.tensor([[-12.0, -1e-3, 0.0, 1e-3, 12.0]], dtype=torch.float64, requires_grad=True)
     log_deviation = Gaussian.bounded(torch.zeros(1, 5, dtype=torch.float64), raw).log_deviation
     assert log_deviation.abs().max() < 5
     torch.testing.assert_close(log_deviation[0, 1:4], raw[0, 1:4], rtol=1e-6, atol=0)
-    (slope,) = torch.autograd.grad(log_deviation.sum(), raw)
-    assert (slope > 0).all()
+    (gradient,) = torch.autograd.grad(log_deviation.sum(), raw)
+    assert (gradient > 0).all()
 
 
-def test_draws_have_the_mean_and_deviation_and_slopes_for_both() -> None:
+def test_draws_have_the_mean_and_deviation_and_gradients_for_both() -> None:
     mean, log_deviation = torch.tensor([[2.0, -1.0]], requires_grad=True), torch.tensor([[0.5, -1.0]])
     drawn = Gaussian(mean.expand(20_000, 2), log_deviation).draw(torch.Generator().manual_seed(0))
     torch.testing.assert_close(drawn.mean(0), mean[0], rtol=0, atol=0.05)
     torch.testing.assert_close(drawn.std(0).log(), log_deviation[0], rtol=0, atol=0.02)
-    (slope,) = torch.autograd.grad(drawn.mean(0).sum(), mean)
-    torch.testing.assert_close(slope, torch.ones(1, 2), rtol=1e-3, atol=0)
+    (gradient,) = torch.autograd.grad(drawn.mean(0).sum(), mean)
+    torch.testing.assert_close(gradient, torch.ones(1, 2), rtol=1e-3, atol=0)
 
 
 def test_the_last_state_of_each_trajectory_is_its_own_successor(method, demonstrations) -> None:
@@ -193,8 +193,8 @@ def test_discriminator_loss_is_the_cross_entropy_of_its_probabilities(make_steps
 def test_on_shared_states_f_settles_in_the_middle_of_the_two_log_probabilities() -> None:
     log_expert, log_pseudo = (torch.tensor(values, dtype=torch.float64) for values in ([0.7, -2.0], [-0.3, 1.0]))
     f = ((log_expert + log_pseudo) / 2).requires_grad_()
-    (slope,) = torch.autograd.grad(discriminator_loss(f - log_expert, f - log_pseudo), f)
-    torch.testing.assert_close(slope, torch.zeros(2, dtype=torch.float64))
+    (gradient,) = torch.autograd.grad(discriminator_loss(f - log_expert, f - log_pseudo), f)
+    torch.testing.assert_close(gradient, torch.zeros(2, dtype=torch.float64))
 
 
 def test_information_surrogate_has_the_gradient_of_the_expectation_under_the_rewards_distribution() -> None:

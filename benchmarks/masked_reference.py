@@ -19,7 +19,7 @@ Sets: TypeAlias = tuple[Steps, Steps, Steps, Steps]
 """τ1 to τ4 of one task."""
 
 
-class MaskedTwin:
+class MaskedReference:
     """DMIL with the settings of `config`."""
 
     def __init__(self, config: DmilConfig) -> None:
