@@ -112,7 +112,7 @@ def _dmil(args: Arguments) -> list[Comparison]:
 
 
 def _measure(comparison: Comparison, rounds: int) -> dict[str, Any]:
-    """Return the row of one contest; seconds are those of one adaptation or one action."""
+    """Return the row of one comparison; seconds are those of one adaptation or one action."""
 
     def repeated(function: Callable[[], object]) -> Callable[[], object]:
         return lambda: [function() for _ in range(comparison.times)]

@@ -1,4 +1,4 @@
-"""What all benchmarks share: rivals timed side by side in alternation, tables, and rows written as JSON."""
+"""What all benchmarks share: functions timed side by side in alternation, tables, and rows written as JSON."""
 
 import json
 import os
@@ -47,12 +47,12 @@ def alternate(
     prepare: Mapping[str, Callable[[], object]] | None = None,
     clock: Callable[[], float] | None = None,
 ) -> dict[str, list[float]]:
-    """Time rivals in alternation, so that whatever else the machine does meets all of them alike.
+    """Time functions in alternation, so that whatever else the machine does meets all of them alike.
 
     Args:
-        functions: the rivals by name, each without arguments.
+        functions: by name, each without arguments.
         rounds: how often each is called; every other round goes backwards, so that none always follows the same.
-        prepare: what is to be called before each call of the rival of that name, untimed.
+        prepare: what is to be called before each call of the function of that name, untimed.
         clock: if not that of the wall.
 
     Returns:
@@ -82,7 +82,7 @@ def lay_out(title: str, rows: Sequence[Mapping[str, str]], words: int = 1, **opt
 
 
 def machine() -> dict[str, Any]:
-    """Return what a row tells of the machine."""
+    """Return what a row holds of the machine."""
     return {"cpus": os.cpu_count(), "load_average": os.getloadavg()[0]}
 
 

@@ -1,6 +1,6 @@
 """The meta-gradient against a masked reference in the plain style, and against the bare matrix products in it.
 
-Three rivals take turns in one run. Ours computes the tasks on two single-threaded worker processes. The reference
+Three computations take turns in one run. Ours computes the tasks on two single-threaded worker processes. The reference
 (benchmarks/masked_reference.py) computes them on two threads. The roofline repeats, on the same two workers, every
 matrix product that ours makes, on matrices of the same shapes and layouts, as many as ours and reused in the same
 order, so that the caches are as cold.
@@ -46,7 +46,7 @@ class Arguments(BenchmarkArguments):
     orders: tuple[Literal["first", "second"], ...] = ("second", "first")
     """Of the meta-gradient."""
     rounds: int = 7
-    """How often each rival is timed; the table shows medians."""
+    """How often each is timed; the table shows medians."""
 
 
 Place: TypeAlias = tuple[int, tuple[int, ...], tuple[int, ...]]

@@ -1,8 +1,8 @@
 """How meta-training scales with Ray's workers, and where the time of an iteration goes.
 
-Demonstrations are made up, in the shape of Meta-World's: 39-dimensional observations, 4-dimensional actions, ten tasks,
-100 steps, five slots a group. The local runner, one worker and two take turns, and medians over all iterations are
-given.
+Demonstrations are synthetic, in the shape of Meta-World's: 39-dimensional observations, 4-dimensional actions, ten
+tasks, 100 steps, five slots a group. The local runner, one worker and two take turns; the table has medians over all
+iterations.
 
 The seconds of an iteration are divided up whole, see `services.distributed.timing.Timing`. The share of the overhead
 is what is left of the iteration beside an ideal one: 1 - (worker compute seconds / workers + step seconds) / iteration
@@ -89,7 +89,7 @@ def measure(trainings: Mapping[str, MetaTraining], turns: Turns) -> dict[str, li
 
 
 def rows_of(size: Size, trainings: Mapping[str, MetaTraining], timings: Mapping[str, list[Timing]]) -> list[Row]:
-    """Return a row for each rival."""
+    """Return a row for each runner."""
     seconds = {name: float(np.median([timing.iteration for timing in of_name])) for name, of_name in timings.items()}
     rows = []
     for name, training in trainings.items():

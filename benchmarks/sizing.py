@@ -1,6 +1,6 @@
 """What a cluster of any size would give meta-training: predicted from costs measured here, for presets of Meta-World.
 
-Measured are, on demonstrations made up in Meta-World's shapes: the gradient of a slot, the outer step and the addition
+Measured are, on synthetic demonstrations in Meta-World's shapes: the gradient of a slot, the outer step and the sum
 of gradients in processor seconds, the least of several rounds, so that other work on the machine counts little; and a
 call, the driver's share of one, and a write into the object store in seconds, on a Ray cluster of one worker. The
 network is assumed, and `benchmarks.cluster_model` puts all together.
@@ -103,7 +103,7 @@ def slot_seconds(plan: Plan, rounds: int) -> list[float]:
 
 
 def own_status(_: object) -> str:
-    """Return what the kernel tells of the process that calls this."""
+    """Return what the kernel reports of the process that calls this."""
     return Path("/proc/self/status").read_text()
 
 

@@ -1,4 +1,4 @@
-"""Errors told in words: those that are the user's to mend, and those that stop a run all the same."""
+"""Errors for people: those that are the user's to mend, and those that stop a run all the same."""
 
 import reprlib
 import traceback

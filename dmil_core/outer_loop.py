@@ -147,7 +147,7 @@ def slot_label(iteration: int, slot: int, task: str, seed: int) -> str:
 
 
 def _finite(result: TaskGradient) -> bool:
-    """Tell whether all is finite; the sum, which nearly always is then, is cheaper to look at."""
+    """Tell whether all is finite; the sum, which nearly always is then, is cheaper to check."""
     gradient = bool(result.gradient.sum().isfinite() or result.gradient.isfinite().all())
     return gradient and all(map(np.isfinite, result.metrics.values()))
 

@@ -1,4 +1,4 @@
-"""What installed packages bring under names of their own, suites and methods alike: told apart, then imported."""
+"""What installed packages bring under names of their own, suites and methods alike: distinguished, then imported."""
 
 import traceback
 from collections.abc import Callable

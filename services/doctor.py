@@ -1,4 +1,4 @@
-"""Check a machine, or the cluster that RAY_ADDRESS names, before a long run; say what to do where something is wrong.
+"""Check a machine, or the cluster that RAY_ADDRESS names, before a long run; with a remedy where something is wrong.
 
 It changes nothing that stays, but for an MLflow experiment named dmil-doctor, whose run it deletes again.
 """
@@ -86,7 +86,7 @@ def _marked(mark: Path) -> Iterator[None]:
 
 
 def examine(nodes: Sequence[NodeFacts]) -> Iterator[Finding]:
-    """Yield what is to be said of some machines that work together."""
+    """Yield the findings on some machines that work together."""
     yield _versions(nodes)
     for node in nodes:
         yield _enough(f"{node.name}: disk", node.disk, DISK_BYTES, "free some, or give --runs on another disk")
@@ -185,7 +185,7 @@ def _mlflow() -> Finding:
         run_id = client.create_run(made).info.run_id
         client.log_metric(run_id, "checked", 1.0)
         client.delete_run(run_id)
-    except Exception as error:  # noqa: BLE001  whatever MLflow raises is told
+    except Exception as error:  # noqa: BLE001  whatever MLflow raises is reported
         return Finding(
             "MLflow", "bad", f"{redacted(uri)}: {error_line(error)}",
             "start it, or mend MLFLOW_TRACKING_URI; a run would go on without, and keep its records",

@@ -60,7 +60,7 @@ def config_type(name: object) -> type[MethodConfig]:
     """Return the class of a method's settings.
 
     Those of ours are found without a look at packages: presets are made of them while modules are imported, where an
-    error would not be told in words.
+    error would have a traceback.
 
     Raises:
         UserError: as `method_type`, if the name is none of ours.

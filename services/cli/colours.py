@@ -3,7 +3,7 @@
 COLOURS = (
     "#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#cc79a7", "#b8a900", "#882255", "#44aa99", "#999999",
 )  # fmt: skip
-"""Told apart by colour-blind eyes (Okabe and Ito 2008, with a darker yellow; the last three are Tol's)."""
+"""Distinct to colour-blind eyes (Okabe and Ito 2008, with a darker yellow; the last three are Tol's)."""
 
 
 def colour_of(index: int) -> str:

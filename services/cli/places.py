@@ -1,4 +1,4 @@
-"""Where results will lie: told before the work begins, and refused where somebody else will delete them."""
+"""Where results will lie: reported before the work begins, and refused where somebody else will delete them."""
 
 import re
 from pathlib import Path

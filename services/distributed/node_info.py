@@ -20,7 +20,7 @@ SECONDS_TO_ANSWER = 60.0
 
 
 class NodeFacts(NamedTuple):
-    """What one machine tells of itself."""
+    """What one machine reports of itself."""
 
     name: str
     versions: dict[str, str]
@@ -44,7 +44,7 @@ class NodeFacts(NamedTuple):
     sees_mark: bool
     """Whether the mark that the asking process made where runs are kept is there too."""
     skew: float = 0.0
-    """Seconds by which its clock is ahead of the asking machine's, as near as a round trip tells."""
+    """Seconds by which its clock is ahead of the asking machine's, to within a round trip."""
 
 
 def facts(runs: str, mark: str, cpus: float | None = None) -> NodeFacts:

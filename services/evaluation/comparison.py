@@ -34,7 +34,7 @@ DIGITS: Mapping[Metric, int] = {"success_rate": 3, "score": 2}
 
 
 class CellKey(NamedTuple):
-    """What tells a cell from the others."""
+    """What identifies a cell."""
 
     row: str
     suite: str
@@ -263,7 +263,7 @@ def cell(
 
 
 def difference(key: CellKey, baseline: str, outcomes: Outcomes, others: Outcomes) -> Difference | Unpaired:
-    """Return how one row differs from another on the seeds and episodes that both have, or why nobody can tell."""
+    """Return how one row differs from another on the seeds and episodes that both have, or why it is not known."""
     seeds = sorted(outcomes.keys() & others.keys())
     pair = {**key._asdict(), "baseline": baseline}
     if not seeds:

@@ -1,4 +1,4 @@
-"""Evaluations of checkpoints: who is tried out on what, the rows that come of it, and those made on the way."""
+"""Evaluations of checkpoints: what is adapted to what, the result rows, and evaluations on the way."""
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence

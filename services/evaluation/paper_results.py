@@ -13,7 +13,7 @@ from services.suites.base import Split
 
 BENCHMARKS = {"ml10": "ML10", "ml45": "ML45"}
 KITCHENS = ("kitchen-topburner", "kitchen-microwave", "kitchen-kettle", "kitchen-slide")
-"""The rows of Table 5; of the last two, which hold the same sub-tasks, the paper does not say which is which."""
+"""The rows of Table 5; of the last two, which hold the same sub-tasks, the paper does not give which is which."""
 
 
 ROWS = {"option-gail": "OptionGAIL"}
@@ -48,7 +48,7 @@ def figure(table: str, row: str, suite: str, split: Split, shots: int) -> Publis
         row: as the paper names it: a method or a variant, K=4, or a number of fine-tuning steps.
         suite: as ml10 or kitchen-kettle.
         split: of its tasks.
-        shots: demonstrations adapted to; Table 5 does not tell how many: its figures stand beside all.
+        shots: demonstrations adapted to; Table 5 does not give their number: its figures stand beside all.
     """
     rows, title = _tables()[table]["rows"], f"Table {table.removeprefix('table')}"
     if table == "table5":

@@ -60,7 +60,7 @@ class AdaptationResult(_Row):
     """How an adapted policy uses its sub-skills on held-out demonstrations of the task."""
 
     steps: int
-    """Demonstrated steps looked at."""
+    """Demonstrated steps that were compared."""
     agreeing: int
     """Of these, where the high level takes the sub-skill that fits the demonstrated action best."""
     sub_skill_steps: tuple[int, ...]

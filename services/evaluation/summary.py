@@ -104,7 +104,7 @@ class Summary(BaseModel):
     failed_attempts: dict[str, int]
     """Attempts of each task's expert that were no success and so no demonstration."""
     demonstrations: dict[str, int] = {}
-    """Of each task, those held out among them; none is told in older files."""
+    """Of each task, those held out among them; older files have none."""
 
     @property
     def collapsed(self) -> bool:

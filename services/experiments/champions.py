@@ -92,7 +92,7 @@ def _model_of(client: "MlflowClient", checkpoint: Checkpoint) -> "LoggedModel":
 
 
 def _address(model_id: str) -> str:
-    """Return what a version says that it was made from: its id it does not always tell."""
+    """Return the source that a version records; its model id is not always recorded."""
     return f"models:/{model_id}"
 
 

@@ -1,4 +1,4 @@
-"""A run that has come to its end, as its folder tells of it."""
+"""A run that has come to its end, read back from its folder."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,7 +24,7 @@ MOST_BYTES = 2**24
 
 @dataclass(frozen=True)
 class FinishedRun(EvaluationFolder):
-    """What ``meta_train`` left behind; each file is read when it is asked for, once."""
+    """What ``meta_train`` left behind; each file is read when it is first used, once."""
 
     @staticmethod
     def find(name: str, runs: Path) -> "FinishedRun":

@@ -114,7 +114,7 @@ def choices_on(group: RunGroup, task: str, shots: int, rollouts: int) -> list[Ch
     Its rollouts are those of the run's own evaluation with the same support set.
 
     Raises:
-        UserError: if no demonstration is left to look at.
+        UserError: if no demonstration is left besides the support set.
     """
     support, others = group.shots(task, shots)
     suite, choices = group.experiment.suite, []

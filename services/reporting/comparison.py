@@ -22,7 +22,7 @@ def compare_runs(runs: Sequence[FinishedRun], baseline: str | None = None) -> Co
     suites = {name: run.config.suite.name for name, run in names.items()}
     if len(set(suites.values())) > 1:
         text = ", ".join(f"{name} of {suite}" for name, suite in suites.items())
-        raise UserError(f"RUN: got {text}; wanted runs of one suite: rates on different tasks are no contest")
+        raise UserError(f"RUN: got {text}; wanted runs of one suite: rates on different tasks cannot be compared")
     rows = _rows(names)
     evaluations = [_evaluation(row, name, names[name]) for row, run_names in rows.items() for name in run_names]
     named = baseline or next(iter(names))

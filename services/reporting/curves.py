@@ -80,7 +80,7 @@ PICTURES: Mapping[str, Sequence[Panel]] = {
         Panel("time besides the work itself", "fraction of the time", ("overhead_share",)),
     ),
 }
-"""What the methods of `dmil_core.methods` measure, in the order in which it is looked at."""
+"""What the methods of `dmil_core.methods` measure, in the order in which it is shown."""
 OTHERS = "Other metrics"
 """The picture of what no panel above names, as a method of one's own may have."""
 UNSHOWN = ("iteration", "environment_steps")

@@ -70,7 +70,7 @@ def embedding_section(group: RunGroup, shots: int = SHOTS, perplexity: float = P
     The perplexity of t-SNE is a third of the states where there are few.
 
     Raises:
-        UserError: if no demonstration is left to look at.
+        UserError: if no demonstration is left besides the support set.
     """
     title = "t-SNE of states by sub-skill"
     if not any(map(has_sub_skills, group.runs.values())):

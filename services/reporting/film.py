@@ -56,7 +56,7 @@ class Side(NamedTuple):
     """The one that acted at each step; none of an expert, or of a method that has but one."""
     success: bool
     ending: str
-    """What is said at the end."""
+    """The text on the last picture."""
 
     def acting(self, step: int) -> int | None:
         """Return the sub-skill whose action led to the state after so many steps."""
@@ -140,7 +140,7 @@ def _font(name: str, size: int) -> ImageFont.FreeTypeFont:
 
 
 def write_film(path: Path, sides: Sequence[Side]) -> None:
-    """Write a film, as its suffix says: MP4 (H.264, yuv420p), which all browsers play, or GIF.
+    """Write a film, by its suffix: MP4 (H.264, yuv420p), which all browsers play, or GIF.
 
     Raises:
         DiskFullError: for want of space; the file is then what it was.

@@ -26,12 +26,12 @@ class Shots(NamedTuple):
     support: Sequence[Demonstration]
     """Those that are adapted to."""
     others: Sequence[Demonstration]
-    """Those that are looked at."""
+    """Those whose states are shown."""
 
 
 @dataclass(frozen=True)
 class RunGroup:
-    """Runs by their labels, and what they are looked at on."""
+    """Runs by their labels, and the tasks and demonstrations that they are shown on."""
 
     runs: Mapping[str, FinishedRun]
     experiment: Experiment
@@ -43,13 +43,13 @@ class RunGroup:
         """Return the first support set of a task, and the demonstrations after it, at most so many.
 
         Raises:
-            UserError: if no demonstration is left to look at.
+            UserError: if no demonstration is left besides the support set.
         """
         held_out = self.held_out[task]
         if len(held_out) <= count:
             raise UserError(
                 f"--shots: got {count}; wanted fewer than the {len(held_out)} held-out demonstrations of {task}, so "
-                "that some are left to look at"
+                "that some are left to show"
             )
         return Shots(held_out[:count], held_out[count:][:others])
 

@@ -87,9 +87,9 @@ def write_run_page(
     finished: FinishedRun,
     path: Path,
     sections: Sequence[Writing] = AT_THE_END,
-    tell: Callable[[], None] = lambda: None,
+    advance: Callable[[], None] = lambda: None,
 ) -> None:
-    """Write the page of a run; `tell` is called after each of its sections.
+    """Write the page of a run; `advance` is called after each of its sections.
 
     Raises:
         UserError: for a file of the run that is missing or damaged.
@@ -98,7 +98,7 @@ def write_run_page(
     written: list[Section] = []
     for write in sections:
         written += write(finished)
-        tell()
+        advance()
     config = finished.config
     title = f"{finished.name}: {config.method.name} on {config.suite.name}"
     write_page(path, title, table_of_all(finished), written)

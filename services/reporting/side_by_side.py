@@ -137,7 +137,7 @@ def _unpaired(comparison: Comparison) -> Iterator[str]:
 
 
 def _benchmarks(comparison: Comparison) -> dict[str, Sequence[str]]:
-    """Return the suites whose tasks are looked at together, by what they are called."""
+    """Return the suites whose tasks stand in one picture, by its name."""
     if comparison.by == "suites" and len(comparison.suites) > 1:
         return {f"{len(comparison.suites)} suites": comparison.suites}
     return {suite: [suite] for suite in comparison.suites}

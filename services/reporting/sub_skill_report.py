@@ -34,7 +34,7 @@ class Arguments:
     which: tyro.conf.Positional[tuple[str, ...]]
     """Runs, by name or folder, or what sweeps have trained, as trained/DIGEST; LABEL=RUN has the page call it so."""
     tasks: tuple[str, ...] | None = None
-    """Tasks to look at; they need not be the runs', only of their kind of robot. If not given, the first run's
+    """Tasks to show; they need not be the runs', only of their kind of robot. If not given, the first run's
     meta-testing tasks, at most 4."""
     shots: int = 1
     """Demonstrations to adapt to for timelines and statistics; one, as in Figure 4b."""

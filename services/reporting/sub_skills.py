@@ -17,7 +17,7 @@ def sub_skill_sections(group: RunGroup, shots: int = 1, rollouts: int = 3) -> li
     """Return a section for each task, with all runs whose methods have sub-skills; none if there is no such run.
 
     Raises:
-        UserError: if no demonstration is left to look at.
+        UserError: if no demonstration is left besides the support set.
     """
     if not any(map(has_sub_skills, group.runs.values())):
         return []

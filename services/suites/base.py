@@ -20,8 +20,8 @@ observations leave out something that the expert needs, the infos of resets and 
 class Expert(Protocol):
     """A scripted expert of one task.
 
-    One expert acts in many episodes, one after the other, and is not told where one begins: all it knows of an episode
-    is in the observation.
+    One expert acts in many episodes, one after the other, and receives no notice of where one begins: all it knows of
+    an episode is in the observation.
     """
 
     def get_action(self, obs: Float64[np.ndarray, " obs_dim"], /) -> Float32[np.ndarray, " action_dim"]:
@@ -30,7 +30,7 @@ class Expert(Protocol):
 
 
 class Measure(NamedTuple):
-    """A number that tells at each step how far an episode has come."""
+    """A number that measures at each step how far an episode has come."""
 
     name: str
     """Of it in the infos of steps."""
@@ -78,7 +78,7 @@ class TaskSuite(Protocol):
 
 
 def measure_of(suite: TaskSuite, task: str) -> Measure | None:
-    """Return what tells how far an episode of a task has come, if the suite names anything."""
+    """Return what measures how far an episode of a task has come, if the suite names anything."""
     if hasattr(suite, "measure_of"):
         return suite.measure_of(task)  # type: ignore[attr-defined]
     return Measure("score", "sub-tasks done") if suite.best_score > 1 else None

@@ -24,7 +24,7 @@ ATTRIBUTES: dict[str, type] = {
 }  # fmt: skip
 METHODS = ("make_env", "expert")
 IN_PROTOCOL = ("protocol", "goal_visible", "start_noise", "horizon")
-"""Settings that an episode depends on, and so the protocol of a suite that heeds them."""
+"""Settings that an episode depends on, and so the protocol of a suite that uses them."""
 GUIDE = "docs/your-own-task.md"
 
 
@@ -115,5 +115,5 @@ def _check_settings(
         if other.protocol == suite.protocol and (field != "horizon" or other.horizon != suite.horizon):
             raise UserError(
                 f"suite.{field}: got {value!r}; without it {suite.name} has the same protocol, {suite.protocol!r}; "
-                "leave it out, or, if the suite heeds it, name it in its protocol"
+                "leave it out, or, if the suite uses it, name it in its protocol"
             )

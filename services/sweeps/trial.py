@@ -39,7 +39,7 @@ _METRICS = TypeAdapter(list[dict[str, float]])
 
 
 class ReportingTracker(Tracker):
-    """Tells Tune too how far the trial is, and what a search goes by."""
+    """Reports to Tune too how far the trial is, and what a search goes by."""
 
     goes_by: str
     _last = 0.0

@@ -105,7 +105,7 @@ def tune_trials(sweep: SweepFolder) -> None:
     left = [name for name, result in results.items() if result is None or result.status == "failed"]
     if not left:
         return
-    # They tell of files that are not written, and of a lost process by its traceback.
+    # They report files that are not written, and of a lost process by its traceback.
     for name in ("analysis.experiment_analysis", "execution.tune_controller"):
         logging.getLogger(f"ray.tune.{name}").setLevel(logging.CRITICAL)
     resources = sweep.record.sweep.resources

@@ -18,11 +18,11 @@ What the appendix leaves open, and what is done here:
   support, or so many evenly spaced ones, and the outer one for as many pairs, drawn evenly from all steps of the task's
   other demonstrations. The encoder sees the whole support in the outer loss, and half of it in each inner pass.
 - **Positions.** Three demonstrations do not fit 250 positions: places count from 0 in each demonstration, and a learned
-  embedding tells which one a step belongs to. A longer demonstration is thinned out to 250 evenly spaced steps.
+  embedding marks which one a step belongs to. A longer demonstration is thinned out to 250 evenly spaced steps.
 - **Shots.** A support set of meta-training has one to `shots` demonstrations, each as often, so that one model serves
   both the 1-shot and the 3-shot test. There is one embedding for each, none for more: more is a `UserError`.
 - **Feed-forward units** are 2,048, as is usual with d_model 512; with it the model has 18.9 M parameters. Positions are
-  encoded by sines. Departures from the original transformer are told in `transformer`.
+  encoded by sines. Departures from the original transformer stand in `transformer`.
 - **Dropout** applies in the outer loss only: the inner gradient should be of the model that acts.
 - **Inner loop.** One step, inner gradients clipped number by number at ±10, and second order, as in MIL. α is 0.001,
   the lower end of MIL's 0.001 to 0.01: with 512 units, 0.01 takes an untrained model's loss up. The size quick is of

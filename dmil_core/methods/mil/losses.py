@@ -134,7 +134,7 @@ def outer_gradient(
 ) -> TaskGradient:
     """Return ∇_θ L_outer(θ') of one task, exact or, with ``config.order == "first"``, taken at θ'.
 
-    The metrics tell the outer loss with and without the inner loop, under the same dropout.
+    The metrics hold the outer loss with and without the inner loop, under the same dropout.
     """
     start = leaves(parameters)
     second = config.order == "second"

@@ -88,7 +88,7 @@ def imitation_rewards(logits: Float[Tensor, " steps"]) -> Float[Tensor, " steps"
 def discriminate(
     moved: Parameters, batch: OptionSteps, expert: OptionSteps, config: OptionGailConfig, generator: torch.Generator
 ) -> dict[str, float]:
-    """Teach the discriminator in place, each minibatch of the policy's steps against as many demonstrated ones."""
+    """Train the discriminator in place, each minibatch of the policy's steps against as many demonstrated ones."""
     losses, k = [], config.sub_skills
     descent = torch.optim.AdamW(
         named(moved, "discriminator."), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
@@ -115,7 +115,7 @@ def _minibatches(count: int, size: int, passes: int, generator: torch.Generator)
 
 
 class Targets(NamedTuple):
-    """What PPO goes by: the standardised advantages of both levels, and what the critic should say of V_L."""
+    """Targets of PPO: the standardised advantages of both levels, and the returns that V_L is fitted to."""
 
     high: Float[Tensor, " steps"]
     low: Float[Tensor, " steps"]
@@ -147,7 +147,7 @@ def ppo_targets(
     beyond: Float[Tensor, "trajectories obs_dim"],
     config: OptionGailConfig,
 ) -> Targets:
-    """Return what PPO goes by in a round.
+    """Return the targets of PPO in a round.
 
     Values are of rewards less the round's mean. `beyond` is each trajectory's state after its last step, where both
     levels are valued by V_H: the next option is not yet drawn.

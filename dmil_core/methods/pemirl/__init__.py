@@ -1,4 +1,4 @@
-"""PEMIRL, behaviour-cloning variant: one policy of all tasks, told which it is by what a demonstration says of it.
+"""PEMIRL, behaviour-cloning variant: one policy for all tasks, conditioned on a context inferred from demonstrations.
 
 Yu et al., "Meta-inverse reinforcement learning with probabilistic context variables" (2019), infer a context m from a
 trajectory and learn for it a policy and a reward, by adversarial inverse reinforcement learning (Fu et al. 2018) with
@@ -41,7 +41,7 @@ What the appendix leaves open, and what we chose:
 - The discriminator does not train ψ, as in the text of the original; its code does it.
 - σ of the policy does not depend on the state and starts at 0.3, where the original's starts at 1: Adam moves log σ by
   at most its learning rate a step, and from 1 the paper's 1e-4 would leave it above 0.8 for 2000 iterations, with
-  likelihoods so flat that the divergence outweighs what m could tell.
+  likelihoods so flat that the divergence outweighs what m could contribute.
 - The last state of a demonstration is its own successor. Hidden layers of reward and potential are as wide as the
   others.
 """

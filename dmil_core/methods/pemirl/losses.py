@@ -1,7 +1,7 @@
 """PEMIRL's four models and its losses, each loss with gradients for the models that it should train alone.
 
 Parameters are named by model: ``encoder`` is q_ψ(m|τ), ``policy`` with ``log_deviation`` is π_ω(a|s,m), ``reward`` is
-r_θ(s,m), ``potential`` is h_φ(s,m). How they fit together is told in `pemirl`.
+r_θ(s,m), ``potential`` is h_φ(s,m). How they fit together stands in `pemirl`.
 """
 
 import math
