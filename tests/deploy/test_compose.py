@@ -13,7 +13,7 @@ from tests.deploy.manifests import COMPOSE, DEPLOY, DOCKERFILE, ask, composed, d
 pytestmark = pytest.mark.thorough
 
 OTHERS = {"postgres": {5432}, "grafana": {3000}}
-"""Ports of programs that need not be told."""
+"""Ports that are the default of their programs."""
 WITHOUT_A_USER_OF_THEIR_IMAGE = {"prometheus", "grafana"}
 """Images of others, which name one that is not root."""
 ADDRESS = re.compile(r"(?:https?|postgresql\+psycopg2)://(?:\w+@)?([a-z][\w.-]*|127\.0\.0\.1):(\d+)")

@@ -32,7 +32,7 @@ pytestmark = pytest.mark.thorough
 SCHEMAS = Path(__file__).parent / "schemas"
 KUBERAY = {"RayCluster": "rayclusters.v1.json", "RayJob": "rayjobs.v1.json"}
 GIVEN = {"postgres": {5432}, "submitter": set()}
-"""Ports of programs that need not be told."""
+"""Ports that are the default of their programs."""
 BYTES = {"Mi": 2**20, "Gi": 2**30}
 WORKER_BYTES = 690_000_000 + 220_000_000 + ENVIRONMENTS_KEPT * 24_000_000
 """Of an adaptation worker at paper size and a simulation worker with all its environments, see docs/performance.md."""

@@ -394,11 +394,11 @@ class Opened:
         found = []
         for element in self.page.locator("main svg[role=img], main img, main video").all():
             box = element.bounding_box()
-            told = element.evaluate(
+            description = element.evaluate(
                 "e => e.alt || e.ariaLabel || [...e.querySelectorAll(':scope > title, :scope > desc')]"
                 ".map(x => x.textContent).join(': ')"
             )
-            found.append((told, box["width"] if box else 0.0, box["height"] if box else 0.0))
+            found.append((description, box["width"] if box else 0.0, box["height"] if box else 0.0))
         return found
 
 

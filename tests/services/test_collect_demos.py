@@ -97,7 +97,7 @@ def test_rollouts_become_demonstrations_that_a_run_learns_from(
 
 
 @pytest.mark.usefixtures("workplace")
-def test_demonstrations_that_cannot_be_used_are_told_in_words(rollouts: str, complaint, tmp_path: Path):
+def test_demonstrations_that_cannot_be_used_are_reported_in_words(rollouts: str, complaint, tmp_path: Path):
     draw = np.random.default_rng(0)
     few = write_npz(tmp_path / "few.npz", [(draw.normal(size=(5, 39)), draw.uniform(-1, 1, (5, 4)))] * 2)
     for name, (demos, said) in enumerate(

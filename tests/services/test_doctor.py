@@ -40,7 +40,7 @@ def test_two_equal_nodes_are_good():
         ({"sees_mark": False}, "two: shared storage", "bad", "does not see", "mount the same folder"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_with_a_node_is_told_with_a_remedy(changed, what: str, verdict: str, got: str, remedy: str):
+def test_what_is_wrong_with_a_node_is_reported_with_a_remedy(changed, what: str, verdict: str, got: str, remedy: str):
     findings = list(examine([GOOD, GOOD._replace(name="two", **changed)]))
     found = of(findings, what)
     assert (found.verdict, [f.what for f in findings if f.verdict != "good"]) == (verdict, [what])

@@ -143,7 +143,7 @@ def test_a_taken_port_is_named_with_who_holds_it(programs, own_token: None, port
     assert f"(process {os.getpid()}) listens; wanted a free one" in said
 
 
-def test_want_of_room_a_stale_token_and_a_damaged_note_are_told(
+def test_want_of_room_a_stale_token_and_a_damaged_note_are_reported(
     programs, own_token: None, ports, workplace: Path, monkeypatch
 ):
     code, said = programs("local_cluster", "start", *ports[:-2], "--object-store-megabytes", "100000000")

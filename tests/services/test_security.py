@@ -62,7 +62,7 @@ def on_loopback(address: str) -> bool:
     ("address", "wanted"),
     [("127.0.0.1", True), ("::1", True), ("::ffff:127.0.0.1", True), ("0.0.0.0", False), ("::", False)],
 )
-def test_loopback_is_told_from_the_rest(address: str, wanted: bool):
+def test_loopback_is_recognised(address: str, wanted: bool):
     assert on_loopback(address) == wanted
 
 

@@ -59,7 +59,7 @@ def test_methods_of_packages_stand_behind_ours(install) -> None:
         ("class Nearest: ...", "wanted a class derived from Method"),
     ],
 )
-def test_a_fault_of_a_package_is_told_in_words(install, code: str, said: str) -> None:
+def test_a_fault_of_a_package_is_reported_in_words(install, code: str, said: str) -> None:
     install("nearest", "faulty_package", code)
     with pytest.raises(UserError, match=r"method\.name: got nearest, faulty_package:Nearest") as caught:
         method_type("nearest")
@@ -67,14 +67,14 @@ def test_a_fault_of_a_package_is_told_in_words(install, code: str, said: str) ->
 
 
 @pytest.mark.parametrize("name", ["foo", 3, ["dmil"]])
-def test_what_names_no_method_is_told_with_all_that_there_are(install, name: object) -> None:
+def test_what_names_no_method_is_reported_with_all_that_there_are(install, name: object) -> None:
     install("nearest", "one_package")
     with pytest.raises(UserError, match=r"method.name: got .*; wanted one of dmil, .*, nearest$"):
         method_type(name)
 
 
 @pytest.mark.parametrize("asked", ["nearest", "dmil", "foo"])
-def test_two_packages_of_one_name_are_told_apart(install, asked: str) -> None:
+def test_two_packages_of_one_name_are_distinguished(install, asked: str) -> None:
     install("nearest", "one_package")
     install("nearest", "another_package")
     with pytest.raises(

@@ -36,7 +36,7 @@ class Terminal(NamedTuple):
             if select.select([self.screen], [], [], 0.2)[0]:
                 try:
                     sent += os.read(self.screen, 65536)
-                except OSError:  # so the end of a terminal is told
+                except OSError:  # so a terminal ends
                     break
         return sent.decode()
 

@@ -140,7 +140,7 @@ ODD = {
 
 
 @pytest.mark.parametrize(("make", "said"), ODD.values(), ids=ODD)
-def test_what_cannot_be_read_is_told_in_words(root: Path, make: Callable[[Path], str], said: str):
+def test_what_cannot_be_read_is_reported_in_words(root: Path, make: Callable[[Path], str], said: str):
     place = make(root)
     with pytest.raises(DemonstrationError) as error:
         read_episodes(place)
@@ -148,7 +148,7 @@ def test_what_cannot_be_read_is_told_in_words(root: Path, make: Callable[[Path],
     assert place.partition(":")[2] in str(error.value)
 
 
-def test_what_does_not_fit_the_suite_is_told_with_its_episode(root: Path):
+def test_what_does_not_fit_the_suite_is_reported_with_its_episode(root: Path):
     metaworld = open_suite(SuiteConfig())
     with pytest.raises(DemonstrationError, match=r"slide\.npz: episode 0: observations: got 60 numbers a step; ml10 w"):
         demonstrations("reach", npz(root / "slide.npz"), metaworld, 10)

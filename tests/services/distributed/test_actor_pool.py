@@ -206,12 +206,12 @@ def test_killing_all_actors_again_and_again_loses_nothing(make, counter: WorkerC
     pool.close()
 
 
-def test_actors_that_cannot_start_are_told(make_broken):
+def test_actors_that_cannot_start_are_reported(make_broken):
     with pytest.raises(RunError, match=r"3 ended while they started.*no such thing"):
         Pool(make_broken, 1)
 
 
-def test_the_death_of_an_actor_of_ones_own_is_told(make, counter: WorkerCounter, tmp_path: Path):
+def test_the_death_of_an_actor_of_ones_own_is_reported(make, counter: WorkerCounter, tmp_path: Path):
     pool, own = Pool(make, 1, listener=counter), make()
     first = pool.submit("two", 1, returns=2)
     deadly = pool.submit("die", tmp_path, 1, first, actor=own)
@@ -221,7 +221,7 @@ def test_the_death_of_an_actor_of_ones_own_is_told(make, counter: WorkerCounter,
     pool.close()
 
 
-def test_an_error_in_a_call_is_told(make):
+def test_an_error_in_a_call_is_reported(make):
     pool = Pool(make, 1)
     with pytest.raises(ArithmeticError, match="out of numbers"):
         pool.result(pool.submit("one", pool.submit("fail")))

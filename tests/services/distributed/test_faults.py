@@ -217,7 +217,7 @@ class FailingDmil(Dmil):
         return super().task_gradient(parameters, batch)
 
 
-def test_an_error_is_told_with_the_command_that_repeats_it(
+def test_an_error_is_reported_with_the_command_that_repeats_it(
     train, workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setitem(OURS, "dmil", FailingDmil)
@@ -286,7 +286,7 @@ def test_a_failing_expert_and_a_failing_trial_are_named(
     reproduce.run([str(workplace / "data")])
 
 
-def test_no_failure_is_told_as_a_users_mistake(complaint, workplace: Path):
+def test_no_failure_is_reported_as_a_users_mistake(complaint, workplace: Path):
     (workplace / "failure.json").write_text('{"where": 1}')
     for given in ("nowhere", "failure.json"):
         assert f"{given}: got" in complaint(reproduce.run, given).replace("/failure.json", "")
@@ -346,7 +346,7 @@ def test_a_run_may_go_on_without_the_steps_that_are_not_finite(train, capsys: py
     assert all(map(np.array_equal, whole.state[1:], finished.state[1:]))
 
 
-def test_a_collapse_is_told_once_when_it_has_lasted():
+def test_a_collapse_is_reported_once_when_it_has_lasted():
     watch = CollapseWatch()
 
     def update(number: int, share: float) -> str | None:
@@ -355,10 +355,10 @@ def test_a_collapse_is_told_once_when_it_has_lasted():
     assert [update(number, 0.995) for number in range(99)] == [None] * 99
     assert update(99, 0.6) is None
     assert [update(number, 0.001) for number in range(100, 199)] == [None] * 99
-    told = update(199, 0.001)
-    assert told is not None
-    assert "sub-skill 1 has taken over 99% of the states for 100 iterations, up to 199" in told
-    assert "--training.learning-rate" in told
+    message = update(199, 0.001)
+    assert message is not None
+    assert "sub-skill 1 has taken over 99% of the states for 100 iterations, up to 199" in message
+    assert "--training.learning-rate" in message
     assert update(200, 0.001) is None
     assert all(CollapseWatch().update(number, {"sub_skill_share/0": 1.0}) is None for number in range(150))
 

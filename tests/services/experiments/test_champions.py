@@ -55,8 +55,8 @@ def promote(runs: Mapping[str, Path], tmp_path: Path, capsys: pytest.CaptureFixt
 
 def test_the_alias_moves_to_what_is_better_outside_its_interval_only(promote, runs: Mapping[str, Path], complaint):
     arguments = ["--runner", "local", "--promote"]
-    told = complaint(evaluate.run, "--checkpoint", str(runs["worse"]), *arguments)
-    assert "which has no MLflow run; wanted the last checkpoint of a finished run" in told
+    message = complaint(evaluate.run, "--checkpoint", str(runs["worse"]), *arguments)
+    assert "which has no MLflow run; wanted the last checkpoint of a finished run" in message
     for run in runs.values():
         tracking_program(["flush", str(run)])
 
@@ -80,21 +80,21 @@ def test_the_alias_moves_to_what_is_better_outside_its_interval_only(promote, ru
     }
 
 
-def test_what_cannot_be_promoted_is_told_before_the_evaluation(
+def test_what_cannot_be_promoted_is_reported_before_the_evaluation(
     promote, runs: Mapping[str, Path], tmp_path: Path, complaint, monkeypatch: pytest.MonkeyPatch
 ):
     for run in runs.values():
         tracking_program(["flush", str(run)])
     promote("better")
     arguments = ["--runner", "local", "--promote", "--output", str(tmp_path / "none")]
-    told = complaint(evaluate.run, "--checkpoint", str(runs["worse"]), *arguments, "--tasks", "reach")
-    assert "--promote: got --tasks with it" in told
+    message = complaint(evaluate.run, "--checkpoint", str(runs["worse"]), *arguments, "--tasks", "reach")
+    assert "--promote: got --tasks with it" in message
 
     other = tmp_path / "other"
     shutil.copytree(runs["worse"], other)
     shutil.copy(runs["better"] / IDENTITY, other)
-    told = complaint(evaluate.run, "--checkpoint", str(other), *arguments)
-    assert "has no model, and 1 of others; wanted" in told
+    message = complaint(evaluate.run, "--checkpoint", str(other), *arguments)
+    assert "has no model, and 1 of others; wanted" in message
 
     checkpoint = ["--checkpoint", str(runs["worse"])]
     uri = os.environ["MLFLOW_TRACKING_URI"]

@@ -197,7 +197,7 @@ def test_practice_ends_an_episode_at_its_success(experiment: Experiment, data):
     ],
 )
 @pytest.mark.usefixtures("workplace")
-def test_a_mistake_is_told_in_words(complaint, workplace: Path, arguments: tuple[str, ...], said: str):
+def test_a_mistake_is_reported_in_words(complaint, workplace: Path, arguments: tuple[str, ...], said: str):
     assert said in complaint(meta_train.run, *arguments, "--preset", "smoke", "--runner", "local")
     assert not (workplace / "runs").exists()
 
@@ -237,7 +237,7 @@ def test_an_installed_method_is_meta_trained_to_its_table(programs, workplace: P
     assert code == 2, printed
 
 
-def test_a_package_s_method_with_a_name_of_ours_is_told_in_words(programs, workplace: Path, monkeypatch):
+def test_a_package_s_method_with_a_name_of_ours_is_reported_in_words(programs, workplace: Path, monkeypatch):
     """In a process of its own: nothing goes wrong before there is somebody to tell."""
     information = workplace / "lib" / "more-1.0.dist-info"
     information.mkdir(parents=True)

@@ -13,7 +13,7 @@ from services.suites.rendering import RenderingError
 
 
 @pytest.fixture
-def told_otherwise(finished: FinishedRun, tmp_path: Path):
+def other_row(finished: FinishedRun, tmp_path: Path):
     """Return the run with other rows: those of the first adaptation, changed."""
 
     def change(**values: object) -> tuple[FinishedRun, EpisodeResult]:
@@ -38,8 +38,8 @@ def test_episodes_come_out_as_their_rows_say(finished: FinishedRun):
         assert one.rollout.seed == one.row.seed
 
 
-def test_what_comes_out_otherwise_is_named(told_otherwise):
-    run, row = told_otherwise(steps=299, success=True)
+def test_what_comes_out_otherwise_is_named(other_row):
+    run, row = other_row(steps=299, success=True)
     with replaying(run) as replay:
         first, _ = replay.rerun(row)
     assert first.difference is not None
@@ -75,7 +75,7 @@ def test_its_demonstration_is_the_one_that_was_adapted_to(finished: FinishedRun)
         ("data", "e" * 64, "got demonstrations with the SHA-256"),
     ],
 )
-def test_an_episode_of_something_else_is_refused(told_otherwise, field: str, wrong: str, words: str):
-    run, row = told_otherwise(**{field: wrong})
+def test_an_episode_of_something_else_is_refused(other_row, field: str, wrong: str, words: str):
+    run, row = other_row(**{field: wrong})
     with pytest.raises(ReplayError, match=words):
         Replay(run).rerun(row)

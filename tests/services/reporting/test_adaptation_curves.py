@@ -74,7 +74,7 @@ def test_what_is_measured_is_not_measured_again(trained: Trained):
     assert runner.calls == first
     (run.folder / "adaptation" / "0000002" / "imitation.jsonl").unlink()  # as though it was stopped there
     assert {point.steps for point in points(run)} == {0}
-    assert "stopped before 2 steps" in told(run)
+    assert "stopped before 2 steps" in text(run)
     measure(run, runner, **SMALL)
     assert runner.calls == first + first // 2
     assert points(run) == whole
@@ -90,7 +90,7 @@ def test_other_settings_are_measured_anew_and_no_others_shown(trained: Trained):
 def test_only_sizes_that_are_held_out_and_that_the_method_takes_are_measured(trained: Trained):
     run = trained("run")
     assert measure(run, counting(run), steps=(0,), episodes=1).evaluation.shots == (1, 3, 5)
-    assert "Not measured for 10 shots" in told(run)
+    assert "Not measured for 10 shots" in text(run)
     mil = trained("mil", "mil")
     sizes = measure(mil, counting(mil), steps=(0,), episodes=1).evaluation.shots
     assert sizes == tuple(size for size in (1, 3, 5) if size <= mil.config.method.model_dump()["shots"])
@@ -115,7 +115,7 @@ def test_a_policy_that_has_diverged_has_no_loss(trained: Trained):
     assert table.rows[1][-2:] == ["", ""]
 
 
-def told(run: FinishedRun) -> str:
+def text(run: FinishedRun) -> str:
     return next(part.text for part in adaptation_section(run).parts if isinstance(part, Prose))
 
 
@@ -140,7 +140,7 @@ def test_the_section_shows_what_was_measured(trained: Trained, planar_visits: Pa
     assert all(f"{round(rate.mean * rate.episodes)} of {rate.episodes}" in cells for rate in own)
 
 
-def test_a_damaged_plan_is_told(trained: Trained):
+def test_a_damaged_plan_is_reported(trained: Trained):
     run = trained("run")
     measure(run, counting(run), shots=(1,), steps=(0,), episodes=1)
     plan = run.folder / "adaptation" / "plan.json"

@@ -25,7 +25,7 @@ def test_each_row_stands_in_a_panel_for_each_split_with_the_papers_figure_beside
     assert {colour_of(0), colour_of(1)} <= set(re.findall(r"#[0-9a-f]{6}", found.svg))
 
 
-def test_without_the_papers_figures_none_are_told_of(tmp_path: Path) -> None:
+def test_without_the_papers_figures_none_are_shown(tmp_path: Path) -> None:
     found = means(comparison_of(make(tmp_path, better, paper=None)))
     assert "paper" not in found.svg + found.description
 

@@ -55,8 +55,8 @@ def test_what_a_method_of_ones_own_measures_is_drawn_too_but_no_evaluation():
     pictures = draw_metrics(course(3, 2, **others, **{"seconds/train": 9.0, "environment_steps": 500.0}))
     assert pictures[-1].title == OTHERS
     assert pictures[-1].description == "Surprise of tasks: surprise of tasks from 3 to 3."
-    told = " ".join(picture.description for picture in pictures)
-    assert not any(word in told for word in ("meta-t", "seconds", "environment steps"))
+    description = " ".join(picture.description for picture in pictures)
+    assert not any(word in description for word in ("meta-t", "seconds", "environment steps"))
 
 
 def test_losses_over_decades_are_drawn_by_their_logarithm_and_fractions_never():

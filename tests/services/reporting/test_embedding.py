@@ -86,12 +86,12 @@ def test_points_are_as_many_as_the_choices_of_each_sub_skill(trained: Trained):
     wanted.update(colour_of(k) for k in range(3))  # in the legend
     assert points_of(picture.svg) == wanted
     states = sum(map(len, others))
-    for told in (
+    for text in (
         f"{states} states, all of those in 5 held-out",
         "paper draws 16; no more are held out",
         "adapted to 3 ",
     ):
-        assert told in picture.description
+        assert text in picture.description
     assert "perplexity 20, seed 7" in picture.description
 
 
@@ -121,9 +121,9 @@ def test_few_states_get_a_perplexity_that_they_allow(trained: Trained):
     group = group_runs({"run": trained("run", demonstrations={"per_task": 8, "held_out": 3})})
     picture = picture_of(embedding_section(group, shots=2, perplexity=1000))
     states = int(picture.description.split()[0])
-    told = re.search(r"perplexity ([\d.]+)", picture.description)
-    assert told is not None
-    assert float(told[1]) == pytest.approx((states - 1) / 3, abs=0.01)
+    text = re.search(r"perplexity ([\d.]+)", picture.description)
+    assert text is not None
+    assert float(text[1]) == pytest.approx((states - 1) / 3, abs=0.01)
 
 
 def test_without_sub_skills_or_demonstrations_there_is_nothing_to_draw(trained: Trained):

@@ -108,7 +108,7 @@ def test_it_draws_what_the_episodes_were(with_rows):
     assert all(f"--task {rows[0].task}" in line for rows, line in zip(worst, commands, strict=True))
 
 
-def test_failures_are_told_apart_by_colour_dash_and_mark(finished: FinishedRun):
+def test_failures_are_distinguished_by_colour_dash_and_mark(finished: FinishedRun):
     courses = [np.linspace(0.3, end, 20) for end in (0.2, 0.1, 0.0)]
     seen = replayed_with(courses, [False, False, True], finished.episodes[0], "d")
     picture = draw_episodes(seen, Measure("d", "distance (m)"), 1)
@@ -141,11 +141,11 @@ def test_a_policy_that_diverged_at_once_has_no_line_but_a_row(with_rows):
     assert "came out otherwise than in the run" in prose(section)[1]
 
 
-def test_what_cannot_be_run_again_is_told_on_the_page(with_rows):
+def test_what_cannot_be_run_again_is_reported_on_the_page(with_rows):
     section = failures_of_run(with_rows(lambda row: True, checkpoint="f" * 64, success=False))
-    (told,) = prose(section)
-    assert told.startswith("Their episodes cannot be run again here: ")
-    assert "the episodes are of ffffffffffff" in told
+    (message,) = prose(section)
+    assert message.startswith("Their episodes cannot be run again here: ")
+    assert "the episodes are of ffffffffffff" in message
 
 
 def test_a_suite_without_a_measure_has_its_episodes_and_no_curve(trained):
@@ -174,9 +174,9 @@ def test_with_videos_its_page_holds_films_that_play(with_rows, open_page):
     (video,) = opened.page.locator("video").all()
     opened.page.wait_for_function("document.querySelector('video').readyState > 0")
     assert video.evaluate("v => [v.videoWidth, v.videoHeight, v.duration > 1]") == [492, 428, True]
-    told = [told for told, width, height in opened.pictures() if width > 300 and height > 60]
-    assert any(words.startswith("door-close, 1-shot, episode") for words in told), "the film says what it is"
-    assert any(words.startswith("door-close, 1-shot: distance to the goal (m)") for words in told)
+    descriptions = [description for description, width, height in opened.pictures() if width > 300 and height > 60]
+    assert any(words.startswith("door-close, 1-shot, episode") for words in descriptions), "the film says what it is"
+    assert any(words.startswith("door-close, 1-shot: distance to the goal (m)") for words in descriptions)
     steps = [int(count) for count in opened.sorted_by("Episodes that were run again", "steps")]
     assert steps == sorted(steps)
     assert len(steps) == len(run.episodes)

@@ -105,9 +105,9 @@ def test_a_film_is_an_mp4_or_a_gif_with_all_its_pictures(tmp_path: Path):
         pictures = list(compose([made_up()], form.rate))
         height, width, _ = pictures[0].shape
         if name == "mp4":
-            told, shown = imageio.immeta(path, plugin="FFMPEG"), imageio.imread(path, plugin="FFMPEG")
-            assert (told["codec"], told["fps"], told["size"]) == ("h264", form.rate, (width, height))
-            assert told["pix_fmt"].startswith("yuv420p")
+            metadata, shown = imageio.immeta(path, plugin="FFMPEG"), imageio.imread(path, plugin="FFMPEG")
+            assert (metadata["codec"], metadata["fps"], metadata["size"]) == ("h264", form.rate, (width, height))
+            assert metadata["pix_fmt"].startswith("yuv420p")
             assert len(shown) == len(pictures)
             difference = np.subtract(border_of(shown[4]), rgb(colour_of(SUB_SKILLS[3])))
             assert np.abs(difference).max() < 30, "but for the compression"

@@ -61,7 +61,7 @@ def test_the_program_says_what_it_draws(capsys: pytest.CaptureFixture[str]):
     assert "gallery   Draw the tasks of every suite" in capsys.readouterr().out
 
 
-def test_a_report_that_there_is_not_is_told_in_words(complaint):
+def test_a_report_that_there_is_not_is_reported_in_words(complaint):
     assert "report: got pie; wanted one of run" in complaint(report.run, "pie")
     assert "report: got nothing" in complaint(report.run)
     assert "suite.name: got atari" in complaint(report.run, "gallery", "--suites", "atari")

@@ -48,7 +48,7 @@ def test_a_page_opens_from_disk_whole_and_accessible(page: Path, open_page, sche
     assert opened.page.title() == "A <run>"
     assert opened.page.locator("h2").all_inner_texts() == ["Tables, and more", "Pictures"]
     pictures = opened.pictures()
-    assert [told for told, _, _ in pictures] == [
+    assert [description for description, _, _ in pictures] == [
         "losses: Two lines <rising> & crossing.", "rates: Two lines <rising> & crossing.", "a film", "another"
     ]  # fmt: skip
     assert all(width >= 64 and height >= 64 for _, width, height in pictures)

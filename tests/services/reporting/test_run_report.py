@@ -28,10 +28,10 @@ def test_a_runs_page_opens_from_disk_whole_and_accessible(finished: FinishedRun,
     assert opened.page.title() == "tiny: dmil on ml10"
     assert opened.page.locator("h2").all_inner_texts() == TITLES
     pictures = opened.pictures()
-    assert [told.partition(": ")[0] for told, _, _ in pictures] == [
+    assert [description.partition(": ")[0] for description, _, _ in pictures] == [
         "meta-training", "meta-testing", "Success over the iterations", "Losses", "Use of sub-skills", "Outer step"
     ]  # fmt: skip
-    assert all(len(told) > 80 and width > 300 and height > 60 for told, width, height in pictures)
+    assert all(len(description) > 80 and width > 300 and height > 60 for description, width, height in pictures)
 
 
 def test_its_tables_sort(finished: FinishedRun, open_page):
@@ -122,7 +122,7 @@ def test_a_page_of_very_many_episodes_says_what_it_leaves_out(finished: Finished
     assert (tmp_path / "page.html").stat().st_size < MOST_BYTES
 
 
-def test_the_program_writes_it_where_it_is_told_and_says_how_to_open_it(finished: FinishedRun, tmp_path: Path, capsys):
+def test_the_program_writes_it_where_it_should_and_prints_how_to_open_it(finished: FinishedRun, tmp_path: Path, capsys):
     path = tmp_path / "made" / "page.html"
     report.run(["run", "tiny", "--runs", str(finished.folder.parent), "--output", str(path)])
     printed = capsys.readouterr().out
@@ -132,24 +132,24 @@ def test_the_program_writes_it_where_it_is_told_and_says_how_to_open_it(finished
     assert ">What failed</h2>" in path.read_text()
 
 
-def test_what_is_no_finished_run_is_told_in_words(finished: FinishedRun, tmp_path: Path, complaint, monkeypatch):
+def test_what_is_no_finished_run_is_reported_in_words(finished: FinishedRun, tmp_path: Path, complaint, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert "RUN: got 'nothing'; wanted a folder with a summary.json" in complaint(report.run, "run", "nothing")
     begun = tmp_path / "runs" / "begun"
     begun.mkdir(parents=True)
     (begun / "config.json").write_text("{}")
-    told = complaint(report.run, "run", "begun")
-    assert "RUN: got runs/begun, which has not come to its end" in told
-    assert "--resume runs/begun" in told
+    message = complaint(report.run, "run", "begun")
+    assert "RUN: got runs/begun, which has not come to its end" in message
+    assert "--resume runs/begun" in message
     evaluation = tmp_path / "evaluation"
     evaluation.mkdir()
     shutil.copy(finished.folder / "summary.json", evaluation)
     assert "has no checkpoints, as the folder of an evaluation" in complaint(report.run, "run", "evaluation")
-    told = complaint(report.run, "run", str(finished.folder), "--output", str(tmp_path))
-    assert f"--output: got {tmp_path}, a folder; wanted a file" in told
+    message = complaint(report.run, "run", str(finished.folder), "--output", str(tmp_path))
+    assert f"--output: got {tmp_path}, a folder; wanted a file" in message
     damaged = tmp_path / "runs" / "damaged"
     shutil.copytree(finished.folder, damaged)
     (damaged / "summary.json").write_text("{}")
-    told = complaint(report.run, "run", "damaged")
-    assert "summary.json: got" in told
-    assert "wanted what a run writes at its end" in told
+    message = complaint(report.run, "run", "damaged")
+    assert "summary.json: got" in message
+    assert "wanted what a run writes at its end" in message

@@ -136,7 +136,7 @@ def test_many_switches_make_no_large_picture():
     assert len(draw_timelines("t", shown, DEMONSTRATIONS, 3).svg) < 800_000
 
 
-def test_usage_and_transitions_are_told_in_numbers():
+def test_usage_and_transitions_are_reported_in_numbers():
     use = draw_usage("t", made_up(), [DEMONSTRATIONS, ROLLOUTS])
     assert "DMIL after adaptation in held-out demonstrations: sub-skill 0 25%, sub-skill 2 75%" in use.description
     assert "DMIL, before, demonstrations" in use.svg
@@ -190,7 +190,7 @@ def test_the_program_writes_one_page_of_several_runs_and_of_tasks_that_are_not_t
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (["flat"], "got flat of behaviour-cloning; wanted at least one of a method with several sub-skills"),
         (["run", "run"], "got run twice"),
@@ -202,10 +202,10 @@ def test_the_program_writes_one_page_of_several_runs_and_of_tasks_that_are_not_t
         (["run", "--perplexity", "nan"], "--perplexity: got nan"),
     ],
 )
-def test_mistakes_are_told(trained: Trained, complaint, arguments: list[str], told: str):
+def test_mistakes_are_reported(trained: Trained, complaint, arguments: list[str], message: str):
     trained("run")
     if "flat" in arguments:
         trained("flat", "behaviour-cloning")
     if "A=longer" in arguments:
         trained("longer", demonstrations={"per_task": 12, "held_out": 8})
-    assert told in complaint(sub_skill_report.run, *arguments)
+    assert message in complaint(sub_skill_report.run, *arguments)

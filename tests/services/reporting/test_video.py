@@ -37,5 +37,5 @@ def test_a_film_of_an_episode_beside_what_it_was_adapted_to(finished: FinishedRu
         (["--task", "reach", "--output", "film.gif"], "--output: got film.gif; wanted a name that ends in .mp4"),
     ],
 )
-def test_what_the_run_does_not_have_is_told_in_words(finished: FinishedRun, complaint, arguments, words: str):
+def test_what_the_run_does_not_have_is_reported_in_words(finished: FinishedRun, complaint, arguments, words: str):
     assert words in complaint(report.run, "video", str(finished.folder), *arguments)

@@ -20,7 +20,7 @@ def test_a_file_is_written_whole_and_in_place_of_another(tmp_path: Path):
 
 
 @pytest.mark.parametrize("words", ["No space left on device", "I/O error: os error 28", "Can't write (errno = 28)"])
-def test_a_full_disk_is_told_with_path_and_bytes(tmp_path: Path, words: str):
+def test_a_full_disk_is_reported_with_path_and_bytes(tmp_path: Path, words: str):
     path = tmp_path / "file"
     with (
         pytest.raises(DiskFullError, match=rf"{path}: needs 9 bytes, its disk had \d+ free") as error,

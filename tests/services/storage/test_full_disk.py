@@ -1,4 +1,4 @@
-"""A full disk is told with the file and the bytes it needs, nothing half-written counts, and the run can go on."""
+"""A full disk is reported with the file and the bytes it needs, nothing half-written counts, and the run can go on."""
 
 import os
 import subprocess

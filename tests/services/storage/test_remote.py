@@ -42,7 +42,7 @@ def server(free_port: Callable[[], int], answers, wait_for, tmp_path_factory) ->
 
 @pytest.fixture(params=[pytest.param("file", marks=pytest.mark.thorough), "s3"])
 def url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """A storage of each kind, which programs are told of too."""
+    """A storage of each kind, which programs receive too."""
     if request.param == "file":
         url = (tmp_path / "storage").as_uri()
     else:
@@ -179,7 +179,9 @@ def test_demonstrations_are_fetched_in_place_of_collected_anew(
     assert all(path.stat().st_mtime >= began - 1 for path in arrays)
 
 
-def test_a_storage_that_is_away_is_told_once_and_stops_nothing(workplace: Path, monkeypatch, free_port, train, capsys):
+def test_a_storage_that_is_away_is_reported_once_and_stops_nothing(
+    workplace: Path, monkeypatch, free_port, train, capsys
+):
     for name, value in {**S3, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{free_port()}", "AWS_MAX_ATTEMPTS": "1"}.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setenv(STORAGE, "s3://bucket/lab")
@@ -191,14 +193,14 @@ def test_a_storage_that_is_away_is_told_once_and_stops_nothing(workplace: Path, 
 
 
 @pytest.mark.parametrize(
-    ("url", "told"),
+    ("url", "message"),
     [
         ("nothing://bucket", "DMIL_STORAGE: got nothing://bucket"),
         ("gs://bucket/lab", "pip install gcsfs"),
     ],
 )
-def test_a_url_that_names_no_storage_is_a_mistake(url: str, told: str, monkeypatch, workplace: Path, complaint):
+def test_a_url_that_names_no_storage_is_a_mistake(url: str, message: str, monkeypatch, workplace: Path, complaint):
     monkeypatch.setenv(STORAGE, url)
     with pytest.raises(UserError), replicated(workplace / "run"):
         pass
-    assert told in complaint(meta_train.run, "--preset", "ml10-smoke", "--runner", "local")
+    assert message in complaint(meta_train.run, "--preset", "ml10-smoke", "--runner", "local")

@@ -195,7 +195,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize(("code", "said"), FAULTS.values(), ids=FAULTS)
-def test_a_fault_of_a_package_is_told_in_words(register, complaint, code: str, said: str):
+def test_a_fault_of_a_package_is_reported_in_words(register, complaint, code: str, said: str):
     register(code)
     flags = ("--suite", "faulty", "--suite.train-tasks", "red-green-blue", "--preset", "smoke", "--runner", "local")
     printed = complaint(meta_train.run, *flags)
@@ -203,7 +203,7 @@ def test_a_fault_of_a_package_is_told_in_words(register, complaint, code: str, s
     assert "Traceback" not in printed
 
 
-def test_two_packages_of_one_name_are_told_apart(register, complaint):
+def test_two_packages_of_one_name_are_distinguished(register, complaint):
     register(faulty("pass"), name="planar-visits")
     printed = complaint(meta_train.run, *SMOKE)
     assert "got planar-visits twice" in printed
@@ -251,7 +251,7 @@ MISTAKES = {
 
 @pytest.mark.parametrize(("flags", "said"), MISTAKES.values(), ids=MISTAKES)
 @pytest.mark.usefixtures("plug_in")
-def test_a_mistake_is_told_in_words(complaint, flags: tuple[str, ...], said: tuple[str, ...]):
+def test_a_mistake_is_reported_in_words(complaint, flags: tuple[str, ...], said: tuple[str, ...]):
     suite = () if "--suite" in flags else SMOKE[:2]
     printed = complaint(meta_train.run, *SMOKE[2:], *suite, *flags)
     for words in said:
@@ -289,7 +289,7 @@ def test_what_no_expert_demonstrates_needs_a_data_set(register, complaint, tmp_p
     assert (tmp_path / "runs/mine/summary.json").exists()
 
 
-def test_demonstrations_that_the_suite_has_outgrown_are_told_by_their_folder(register, complaint, tmp_path: Path):
+def test_demonstrations_that_the_suite_has_outgrown_are_reported_by_their_folder(register, complaint, tmp_path: Path):
     collect_demos.run([*SMOKE])
     (stored,) = (tmp_path / "data/planar-visits/red-green-blue").iterdir()
     register(
@@ -358,7 +358,7 @@ def test_verify_says_what_is_wrong_with_an_environment(register, capsys, methods
     ],
 )
 @pytest.mark.usefixtures("plug_in")
-def test_what_names_no_suite_or_task_is_told_in_words(complaint, flags: tuple[str, ...], said: str):
+def test_what_names_no_suite_or_task_is_reported_in_words(complaint, flags: tuple[str, ...], said: str):
     assert said in complaint(collect_demos.run, *flags)
 
 

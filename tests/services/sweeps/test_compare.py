@@ -64,8 +64,8 @@ def test_methods_and_seeds_stand_side_by_side_on_a_page(place: Path, open_page, 
         "Settings that differ", "Runs and commands",
     ]  # fmt: skip
     pictures = opened.pictures()
-    assert all(told and width > 300 and height > 60 for told, width, height in pictures)
-    titles = [told.partition(":")[0] for told, _, _ in pictures]
+    assert all(description and width > 300 and height > 60 for description, width, height in pictures)
+    titles = [description.partition(":")[0] for description, _, _ in pictures]
     assert titles == [
         "Mean success rate of each row; bars are 95% intervals",
         *(f"Performance profile, ml10, {split}" for split in ("meta-training", "meta-testing")),
@@ -162,7 +162,7 @@ def test_scores_are_compared_where_there_are_scores(place: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (["dmil-seed-0"], "RUN: got dmil-seed-0; wanted two finished runs or more"),
         (["dmil-seed-0", "none-such"], "RUN: got 'none-such'; wanted a folder with a summary.json"),
@@ -176,10 +176,10 @@ def test_scores_are_compared_where_there_are_scores(place: Path) -> None:
         (["made-up", "--baseline", "x"], "--baseline: got 'x'; wanted one of DMIL, DMIL-High"),
     ],
 )
-def test_mistakes_are_told(place: Path, complaint: Callable[..., str], arguments: list[str], told: str) -> None:
+def test_mistakes_are_reported(place: Path, complaint: Callable[..., str], arguments: list[str], message: str) -> None:
     make_run(place / "runs" / "elsewhere", lambda *of: True, settings={"suite": {"name": "ml45"}})
     make(place / "runs", better)
-    assert told in complaint(report.run, "compare", *arguments)
+    assert message in complaint(report.run, "compare", *arguments)
     assert not (place / "comparison.html").exists()
 
 
@@ -215,12 +215,12 @@ def test_suites_in_the_rows_are_tasks_of_one_profile(tmp_path: Path, open_page) 
     )
     report.run(["compare", str(sweep.path)])
     pictures = open_page(sweep.path / "tables" / "report.html").pictures()
-    profiles = [told for told, _, _ in pictures if told.startswith("Performance")]
+    profiles = [description for description, _, _ in pictures if description.startswith("Performance")]
     assert len(profiles) == 1
     assert "1-shot K=4: 1.50 over 12 runs" in profiles[0]
-    maps = [told for told, _, _ in pictures if told.startswith("Score on each task")]
+    maps = [description for description, _, _ in pictures if description.startswith("Score on each task")]
     assert len(maps) == 2
-    assert all("kitchen-kettle: " in told for told in maps)
+    assert all("kitchen-kettle: " in description for description in maps)
 
 
 def test_real_runs_with_evaluations_on_the_way(train, workplace: Path, open_page) -> None:
@@ -231,7 +231,9 @@ def test_real_runs_with_evaluations_on_the_way(train, workplace: Path, open_page
     report.run(["compare", "smoke-seed-0", "smoke-seed-1", "behaviour"])
     opened = open_page(workplace / "comparison.html")
     assert (opened.requests, opened.complaints, opened.faults()) == ([], [], [])
-    curve = next(told for told, _, _ in opened.pictures() if told.startswith("Success rate over training"))
+    curve = next(
+        description for description, _, _ in opened.pictures() if description.startswith("Success rate over training")
+    )
     assert "meta-training, 1-shot: smoke from" in curve
     assert set(opened.sorted_by("Runs", "row")) == {"smoke", "behaviour"}
     assert opened.sorted_by("Success rates", "tasks")[0] in "13"

@@ -119,7 +119,7 @@ def test_a_preset_has_its_own_budget() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"variants": {"one": {"method": {"sub_skill": 3}}}}, "variants.one: got the unknown key method.sub_skill"),
         ({"settings": {"training": {"iterations": -1}}}, "one on ml10: training.iterations: got -1"),
@@ -128,8 +128,8 @@ def test_a_preset_has_its_own_budget() -> None:
         ({"evaluations": {"a": {"shots": [9]}}}, "evaluations.a: .*held_out: got 20; wanted at least 36"),
     ],
 )
-def test_a_setting_that_there_is_not_is_named_with_its_place(changes: dict, told: str) -> None:
-    with pytest.raises((UserError, ValidationError), match=told):
+def test_a_setting_that_there_is_not_is_named_with_its_place(changes: dict, message: str) -> None:
+    with pytest.raises((UserError, ValidationError), match=message):
         planned(small(**changes).at("quick"), "quick")
 
 
@@ -183,14 +183,14 @@ def test_a_range_is_kept(log: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    ("suite", "told"),
+    ("suite", "message"),
     [
         ({}, "wanted some of ml10's own meta-training tasks, held out"),
         ({"test_tasks": ["door-close"], "train_tasks": ["reach"]}, "got door-close; wanted some of ml10's own"),
         ({"test_tasks": ["reach"]}, "train_tasks: got reach; wanted those not in test_tasks"),
     ],
 )
-def test_a_search_must_not_look_at_meta_testing_tasks(suite: dict, told: str) -> None:
-    with pytest.raises(UserError, match=told):
+def test_a_search_must_not_look_at_meta_testing_tasks(suite: dict, message: str) -> None:
+    with pytest.raises(UserError, match=message):
         planned(search(**suite).at("quick"), "quick")
     assert planned(search(train_tasks=["push"], test_tasks=["reach"]).at("quick"), "quick")

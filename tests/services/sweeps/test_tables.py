@@ -87,7 +87,7 @@ def test_pairing_decides_what_the_intervals_alone_do_not(tmp_path: Path) -> None
     assert {d.differs for d in tables.differences} == {"yes, higher"}
 
 
-def test_rows_that_win_in_turn_are_not_told_apart(tmp_path: Path) -> None:
+def test_rows_that_win_in_turn_are_not_distinguished(tmp_path: Path) -> None:
     def solved(variant: str, seed: int, split: str, shots: int, task: str, episode: int) -> float:
         return float((episode % 2 == 0) == (variant == "DMIL"))
 

@@ -100,8 +100,8 @@ def test_what_a_sweep_trained_is_fetched_elsewhere(programs, workplace: Path, tm
         (home,), (log,) = workplace.glob("runs/trained/*"), workplace.glob("runs/once/trials/*/log.txt")
         return newest(home).digest, (home / "metrics.json").read_bytes(), log.read_text()
 
-    digest, curves, told = trained()
-    assert "trained already" not in told
+    digest, curves, log = trained()
+    assert "trained already" not in log
     shutil.rmtree(workplace / "runs")
     again = trained()
     assert again[:2] == (digest, curves)
@@ -139,7 +139,7 @@ def named(processes: Iterable[psutil.Process], name: str) -> list[psutil.Process
 def test_a_trial_that_fails_or_dies_leaves_the_others_alone(
     programs, workplace: Path, mlflow_file: str, runs_of, wait_for
 ) -> None:
-    """One has an error, which is told; one loses its process, and is begun again; trials of two CPUs each."""
+    """One has an error, which is reported; one loses its process, and is begun again; trials of two CPUs each."""
     variants = {"good": {}, "diverging": {"training": {"learning_rate": 1e30}}}
     file = write_sweep(variants, resources={"workers": 2})
     program = programs.start("tune_sweep", file, "--preset", "smoke", "--name", "hurt")
@@ -171,7 +171,7 @@ def test_a_trial_that_fails_or_dies_leaves_the_others_alone(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         ([], "SWEEP: got none; wanted a file"),
         (["nope"], "SWEEP: got nope"),
@@ -184,13 +184,13 @@ def test_a_trial_that_fails_or_dies_leaves_the_others_alone(
     ],
 )
 @pytest.mark.usefixtures("workplace")
-def test_mistakes_are_told(complaint, arguments: list[str], told: str) -> None:
-    assert told in complaint(tune_sweep.run, *arguments)
+def test_mistakes_are_reported(complaint, arguments: list[str], message: str) -> None:
+    assert message in complaint(tune_sweep.run, *arguments)
     assert not Path("runs").exists()
 
 
 @pytest.mark.usefixtures("workplace")
-def test_a_mistake_in_a_file_is_told_with_its_place(complaint) -> None:
+def test_a_mistake_in_a_file_is_reported_with_its_place(complaint) -> None:
     file = write_sweep({"one": {"method": {"sub_skill": 3}}})
     assert "variants.one: got the unknown key method.sub_skill" in complaint(tune_sweep.run, file)
     Path(file).write_text("what: [")

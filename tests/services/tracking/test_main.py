@@ -80,5 +80,5 @@ def test_what_holds_no_run_is_refused(tmp_path: Path, complaint):
 
 def test_a_report_is_delivered_again_where_there_is_one_only(complaint, tmp_path: Path):
     (tmp_path / "tracking.jsonl").write_text("")
-    told = complaint(tracking_program, "report", str(tmp_path))
-    assert f"RUN: got {tmp_path}, which has no folder report; wanted a finished run" in told
+    message = complaint(tracking_program, "report", str(tmp_path))
+    assert f"RUN: got {tmp_path}, which has no folder report; wanted a finished run" in message

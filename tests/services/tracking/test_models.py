@@ -80,7 +80,7 @@ def test_it_acts_as_the_adapted_policy_step_by_step(untrained, kind: type[Imitat
 
 @pytest.fixture
 def own_mlflow(mlflow_file: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """MLflow itself is told where it is, as a user does, and forgets it after the test."""
+    """MLflow itself receives its address, as a user does, and forgets it after the test."""
     monkeypatch.setenv("MLFLOW_TRACKING_URI", mlflow_file)
     yield mlflow_file
     mlflow.set_tracking_uri(None)  # pyright: ignore[reportArgumentType]  so it is forgotten
@@ -119,9 +119,9 @@ def test_mlflow_loads_it_without_pickle_and_predicts(untrained, own_mlflow: str,
     for placeholder, own in (("ml10@champion", model.model_id), ("sqlite:///mlflow.db", own_mlflow)):
         assert snippet.count(placeholder) == 1
         snippet = snippet.replace(placeholder, own)
-    told: dict[str, Any] = {}
-    exec(snippet, told)
-    assert (len(told["action"]), told["memory"]) == (4, [])
+    namespace: dict[str, Any] = {}
+    exec(snippet, namespace)
+    assert (len(namespace["action"]), namespace["memory"]) == (4, [])
     with pytest.raises(UserError, match=r"observation: got the shape \(2,\); wanted 39 numbers"):
         loaded.predict(packed(support, observation[:2]))
 

@@ -30,7 +30,7 @@ def test_what_is_packed_comes_back_through_json_to_the_bit():
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"support": None}, "support: got None; wanted a list of at least one demonstration"),
         ({"support": []}, "support: got []; wanted a list of at least one demonstration"),
@@ -54,7 +54,7 @@ def test_what_is_packed_comes_back_through_json_to_the_bit():
         ({"memory": ["x"]}, "memory: got ['x']; wanted whole numbers"),
     ],
 )
-def test_a_mistake_is_told_with_its_place(changes: dict[str, Any], told: str):
+def test_a_mistake_is_reported_with_its_place(changes: dict[str, Any], message: str):
     with pytest.raises(UserError) as caught:
         unpacked(packed([ONE], ONE.observations[0]) | changes, 3, 2)
-    assert told in str(caught.value)
+    assert message in str(caught.value)

@@ -208,7 +208,7 @@ def action_error(policy: Policy, demonstrations: list[Demonstration]) -> float:
 
 @pytest.mark.thorough
 @pytest.mark.usefixtures("unchecked")
-def test_new_tasks_are_told_from_one_or_two_demonstrations() -> None:
+def test_new_tasks_are_inferred_from_one_or_two_demonstrations() -> None:
     sets = training_sets(16)
     every = list(itertools.chain(*sets.values()))
     config = PemirlConfig(
