@@ -63,7 +63,7 @@ class Camera:
         """
         self._env: Any = env.unwrapped
         model = self._env.model
-        self._view = _looking(model, view)
+        self._view = _camera(model, view)
         self._scene, self._frame = mujoco.MjvScene(model, maxgeom=10_000), mujoco.MjrRect(0, 0, width, height)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         self._surface = _surface(height, width)
@@ -107,7 +107,7 @@ def picture(
         return camera.picture()
 
 
-def _looking(model: Any, view: str | View) -> Any:
+def _camera(model: Any, view: str | View) -> Any:
     looking = mujoco.MjvCamera()
     if isinstance(view, View):
         looking.lookat[:], looking.distance, looking.azimuth, looking.elevation = view

@@ -80,7 +80,7 @@ class Identity(BaseModel):
             ) from error
 
     @staticmethod
-    def found_or_made(folder: Path, experiment: str, parent: str | None = None) -> "Identity":
+    def find_or_make(folder: Path, experiment: str, parent: str | None = None) -> "Identity":
         """Read the identity of a run, or give it one, as a trial of the run with the tag `parent`.
 
         Raises:

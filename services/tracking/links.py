@@ -38,7 +38,7 @@ def comparison_link(uri: str, experiment_id: str, run_ids: Sequence[str]) -> str
     return f"{_site(uri)}/#/compare-runs?runs={runs}&experiments={experiments}&{TRAINING}"
 
 
-def how_to_look(uri: str) -> str | None:
+def ui_command(uri: str) -> str | None:
     """Return the command that serves the pages of an MLflow that is a file, or None of one that serves them itself."""
     if not uri.startswith("sqlite"):
         return None

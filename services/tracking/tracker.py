@@ -13,7 +13,7 @@ from dmil_core.errors import RunError
 from services.storage.provenance import git_commit, library_versions
 from services.storage.redaction import error_line, redacted
 from services.tracking.delivery import Delivery, Identity
-from services.tracking.links import how_to_look, run_link, tracking_uri
+from services.tracking.links import run_link, tracking_uri, ui_command
 from services.tracking.packing import packed
 from services.tracking.spool import Artifact, Ended, Example, Measured, Spool, Trained
 
@@ -52,7 +52,7 @@ class Tracker:
         self.uri = redacted(uri)
         """Of MLflow, without secrets."""
         self._folder = folder
-        Identity.found_or_made(folder, experiment, None if parent is None else Identity.of(parent).tag)
+        Identity.find_or_make(folder, experiment, None if parent is None else Identity.of(parent).tag)
         self._spool = Spool(folder / "tracking.jsonl")
         self._delivery = Delivery(folder, uri)
         self._opened = time.monotonic()
@@ -72,7 +72,7 @@ class Tracker:
         """Lines that say where the MLflow run is, as far as it is known, and how to look at it."""
         run_id, experiment_id, uri = self.run_id, self._delivery.identity.experiment_id, tracking_uri()
         lines = [f"MLflow run: {run_id or 'not there yet'} at {self.uri}"]
-        if (command := how_to_look(uri)) is not None:
+        if (command := ui_command(uri)) is not None:
             lines.append(f"to look at it: {command}")
         if run_id is not None and experiment_id is not None:
             lines.append(f"its page: {run_link(uri, experiment_id, run_id)}")

@@ -115,7 +115,7 @@ def test_a_long_answer_is_read_whole(serve):
     ("experiment", "run"), [("../../x", "0" * 32), ("1", "../../x"), ("1", "0" * 31), ("1", "0" * 32 + "\n")]
 )
 def test_what_is_no_id_is_not_believed(serve, tmp_path: Path, experiment: str, run: str):
-    tag = Identity.found_or_made(tmp_path, "an experiment").tag
+    tag = Identity.find_or_make(tmp_path, "an experiment").tag
     info = {"run_id": run, "run_uuid": run, "experiment_id": experiment, "status": "RUNNING"}
     body = {
         "experiment": {"experiment_id": experiment, "name": "x", "artifact_location": "mlflow-artifacts:/1"},

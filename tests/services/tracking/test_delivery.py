@@ -104,7 +104,7 @@ def test_a_damaged_identity_is_named(tmp_path: Path, content: str):
 
 
 def test_more_delivered_than_there_is_is_refused(tmp_path: Path):
-    identity = Identity.found_or_made(tmp_path, "an experiment").model_copy(update={"delivered": 2})
+    identity = Identity.find_or_make(tmp_path, "an experiment").model_copy(update={"delivered": 2})
     (tmp_path / "mlflow_run.json").write_text(identity.model_dump_json())
     (tmp_path / "tracking.jsonl").write_text('["tags", {}]\n')
     with pytest.raises(UserError, match="got 2 records delivered; wanted at most the 1 of"):

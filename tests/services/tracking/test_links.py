@@ -2,7 +2,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
-from services.tracking.links import comparison_link, how_to_look, run_link
+from services.tracking.links import comparison_link, run_link, ui_command
 
 
 @pytest.mark.parametrize(
@@ -33,4 +33,4 @@ def test_links_lead_to_the_pages_of_the_server_or_of_mlflow_ui_without_secrets(u
     ],
 )
 def test_a_file_is_looked_at_with_a_server_of_one_s_own(uri: str, command: str | None):
-    assert how_to_look(uri) == command
+    assert ui_command(uri) == command

@@ -56,7 +56,7 @@ def test_a_folder_that_says_to_be_another_s_changes_nothing_there(
     assert f"{gift / IDENTITY}: got the MLflow run {before.info.run_id}" in str(caught.value)
     assert MlflowClient(mlflow_file).get_run(before.info.run_id).to_dictionary() == before.to_dictionary()
     (gift / IDENTITY).unlink()
-    Identity.found_or_made(gift, "an experiment")  # as --resume does
+    Identity.find_or_make(gift, "an experiment")  # as --resume does
     deliver(gift, mlflow_file)
     assert Identity.of(gift).run_id not in (None, before.info.run_id)
 

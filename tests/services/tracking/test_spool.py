@@ -27,7 +27,7 @@ from tests.services.tracking.conftest import records
     ],
 )
 def test_a_damaged_record_is_named_by_file_and_line(tmp_path: Path, line: str, complaint):
-    Identity.found_or_made(tmp_path, "an experiment")
+    Identity.find_or_make(tmp_path, "an experiment")
     (tmp_path / "tracking.jsonl").write_text(f'["tags", {{}}]\n{line}\n["tags", {{}}]\n')
     printed = complaint(tracking_program, "flush", str(tmp_path))
     assert f"{tmp_path / 'tracking.jsonl'}, line 2: got " in printed
