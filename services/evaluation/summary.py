@@ -250,8 +250,13 @@ def headline(summary: Summary) -> list[list[str]]:
     best = max((cell.score.best for cell in summary.rows if cell.score), default=1)
     tables = {cell.paper.table for cell in summary.rows if cell.paper}
     columns += [f"score of {best}", "95% interval", f"best {BEST} a task", ", ".join(["paper", *sorted(tables)])]
-    kept = [index for index in range(len(columns)) if any(row[index] for row in rows)]
-    return [[fields[index] for index in kept] for fields in (columns, *rows)]
+    return without_empty_columns(columns, rows)
+
+
+def without_empty_columns(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[list[str]]:
+    """Return the head and the rows without the columns that no row has anything in."""
+    kept = [index for index in range(len(head)) if any(row[index] for row in rows)]
+    return [[fields[index] for index in kept] for fields in (head, *rows)]
 
 
 def _fields(cell: SummaryRow) -> list[str]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from dmil_core.statistics import interval_text
 from services.evaluation.comparison import DIGITS, Cell, CellKey, Comparison, Difference, SeedEvaluation, Unpaired
+from services.evaluation.summary import without_empty_columns
 from services.reporting.bands import curves
 from services.reporting.comparison_pictures import Runs, heat_map, means, profiles
 from services.reporting.drawing import Picture
@@ -99,9 +100,8 @@ def _place(comparison: Comparison, cell: Cell | Difference) -> list[str]:
 
 
 def _filled(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> DataTable:
-    """Return a table without the columns that no row has anything in."""
-    kept = [index for index in range(len(head)) if any(row[index] for row in rows)]
-    return DataTable(caption, [head[index] for index in kept], [[row[index] for index in kept] for row in rows])
+    kept, *fields = without_empty_columns(head, rows)
+    return DataTable(caption, kept, fields)
 
 
 def _differences(comparison: Comparison) -> list[Part]:
