@@ -182,12 +182,39 @@ class Comparison:
         return [self._cell(key) for key in self.keys if key in self.outcomes]
 
     def _cell(self, key: CellKey) -> Cell:
+        """Return the mean of a cell's outcomes with its interval, beside the paper's figure."""
+        outcomes, paper = self.outcomes[key], self.published.get(key)
         evaluations = [of for of in self.evaluations if (of.row, of.suite) == (key.row, key.suite)]
-        adaptations = [row for of in evaluations for row in of.adaptations if row.shots == key.shots]
-        use = sub_skill_shares(adaptations).get(key.split)
-        steps = sum(of.environment_steps for of in evaluations)
-        in_use = use and use.in_use_per_task
-        return cell(key, self.outcomes[key], in_use, self.published.get(key), self.metric, steps)
+        use = sub_skill_shares([row for of in evaluations for row in of.adaptations if row.shots == key.shots])
+        seeds = sorted(outcomes)
+        values = np.stack([outcomes[seed].outcomes for seed in seeds])
+        if len(seeds) > 1:
+            estimate = stratified_bootstrap(values, named_rng(0, "table", *map(str, key)))
+            kind = "bootstrap over seeds and episodes"
+        elif self.metric == "success_rate":
+            estimate, kind = success_rate((values > 0).ravel().tolist()), "Wilson"
+        else:
+            estimate, kind = mean_score(values.ravel().tolist()), "Student"
+        mean, low, high = estimate.mean, *((None, None) if np.isnan(estimate.low) else (estimate.low, estimate.high))
+        outside = None
+        if paper is not None and low is not None and high is not None:
+            outside = not low <= paper.value <= high and abs(mean - paper.value) > (paper.spread or 0.0)
+        return Cell(
+            **key._asdict(),
+            seeds=seeds,
+            tasks=values.shape[1],
+            episodes=values.size,
+            mean=mean,
+            low=low,
+            high=high,
+            interquartile_mean=interquartile_mean(values.mean(2).ravel().tolist()),
+            interval=kind,
+            sub_skills_in_use=use[key.split].in_use_per_task if key.split in use else None,
+            environment_steps=sum(of.environment_steps for of in evaluations),
+            paper=paper,
+            difference=None if paper is None else mean - paper.value,
+            outside=outside,
+        )
 
     @cached_property
     def pairs(self) -> list[Difference | Unpaired]:
@@ -219,46 +246,6 @@ def _other_episodes(evaluation: SeedEvaluation, got: tuple[int, ...]) -> UserErr
         f"{evaluation.folder}: got rows of {evaluation.row} with not as many episodes of each task and seed: "
         f"{', '.join(map(str, got))}; remove the folder, in a sweep also trials/{evaluation.name}/result.json, and "
         "evaluate again"
-    )
-
-
-def cell(
-    key: CellKey,
-    outcomes: Outcomes,
-    in_use: float | None,
-    paper: Published | None,
-    metric: Metric,
-    environment_steps: int = 0,
-) -> Cell:
-    """Return the mean of some outcomes with its interval, beside the paper's figure."""
-    seeds = sorted(outcomes)
-    values = np.stack([outcomes[seed].outcomes for seed in seeds])
-    if len(seeds) > 1:
-        estimate = stratified_bootstrap(values, named_rng(0, "table", *map(str, key)))
-        kind = "bootstrap over seeds and episodes"
-    elif metric == "success_rate":
-        estimate, kind = success_rate((values > 0).ravel().tolist()), "Wilson"
-    else:
-        estimate, kind = mean_score(values.ravel().tolist()), "Student"
-    mean, low, high = estimate.mean, *((None, None) if np.isnan(estimate.low) else (estimate.low, estimate.high))
-    outside = None
-    if paper is not None and low is not None and high is not None:
-        outside = not low <= paper.value <= high and abs(mean - paper.value) > (paper.spread or 0.0)
-    return Cell(
-        **key._asdict(),
-        seeds=seeds,
-        tasks=values.shape[1],
-        episodes=values.size,
-        mean=mean,
-        low=low,
-        high=high,
-        interquartile_mean=interquartile_mean(values.mean(2).ravel().tolist()),
-        interval=kind,
-        sub_skills_in_use=in_use,
-        environment_steps=environment_steps,
-        paper=paper,
-        difference=None if paper is None else mean - paper.value,
-        outside=outside,
     )
 
 
