@@ -12,6 +12,7 @@ import tyro
 from pydantic import ValidationError
 
 from dmil_core.errors import RunError, UserError, describe_errors
+from services.cli.escapes import for_terminal
 from services.cli.progress import console_logging
 
 T = TypeVar("T")
@@ -30,7 +31,10 @@ PROGRAMS = {
     "tune-sweep": "run an ablation or a search on Ray Tune",
     "doctor": "check a machine or a cluster before a long run",
     "report": "draw what there is to look at, and lay tables out",
+    "tracking": "deliver to MLflow what a run left behind, or serve its pages",
+    "reproduce": "run the work item again in which a program failed",
 }
+"""Of ``dmil``, which imports nothing from the folder that it is called in, as ``python -m`` does."""
 
 
 def peek(arguments: Sequence[str], **options: Callable[[str], Any]) -> argparse.Namespace:
@@ -70,7 +74,7 @@ def exit_code(program: Callable[[Sequence[str]], None], arguments: Sequence[str]
         with console_logging(quiet="--quiet" in arguments):
             program(arguments)
     except (UserError, RunError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {for_terminal(str(error))}", file=sys.stderr)
         return 2 if isinstance(error, UserError) else 1
     except KeyboardInterrupt:
         return 143 if received else 130
@@ -83,7 +87,8 @@ def main() -> None:
     """Run one of the programs as a subcommand of ``dmil``."""
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name in PROGRAMS:
-        sys.exit(exit_code(import_module(f"services.{name.replace('-', '_')}").run, sys.argv[2:]))
+        module = "tracking.__main__" if name == "tracking" else name.replace("-", "_")
+        sys.exit(exit_code(import_module(f"services.{module}").run, sys.argv[2:]))
     print("usage: dmil PROGRAM [--help]\n")
     for program, purpose in PROGRAMS.items():
         print(f"  {program:15}{purpose}")

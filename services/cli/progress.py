@@ -6,11 +6,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import TracebackType
+from typing import Any
 
 from rich.console import Console
 from rich.live import Live
 from rich.progress import Progress
+from rich.text import Text
 
+from services.cli.escapes import for_terminal
 from services.cli.live_view import Pace, Screen, Status
 
 LINE_SECONDS = 5.0
@@ -26,13 +29,23 @@ class Output(Console):
     plain = False
     """Whether plain lines are wanted in place of the screen."""
 
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return a text without what would steer the terminal: it may hold a name that somebody else chose."""
+        return super().render_str(for_terminal(text), **options)
+
     @property
     def live(self) -> bool:
         """Whether there is a screen that can be drawn over."""
         return self.is_interactive and self.file.isatty() and not self.plain
 
 
-console = Output(highlight=False, soft_wrap=not sys.stdout.isatty(), width=None if sys.stdout.isatty() else 160)
+console = Output(
+    markup=False,
+    emoji=False,
+    highlight=False,
+    soft_wrap=not sys.stdout.isatty(),
+    width=None if sys.stdout.isatty() else 160,
+)
 
 
 class _ConsoleHandler(logging.Handler):

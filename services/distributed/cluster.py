@@ -4,13 +4,19 @@ import logging
 import os
 import secrets
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dmil_core.errors import UserError
 from services.storage.private import bypass_proxies, private_folder
 from services.storage.redaction import error_line, redacted
+
+if TYPE_CHECKING:
+    from ray.job_config import JobConfig
 
 OBJECT_STORE_BYTES = 500_000_000
 SECONDS_TO_ANSWER = 10.0
@@ -46,6 +52,7 @@ def joined(workers: int | None = None) -> Iterator[None]:
                 address="local",
                 num_cpus=max(os.cpu_count() or 1, workers or 0),
                 include_dashboard=False,
+                job_config=_job_config(),
                 object_store_memory=OBJECT_STORE_BYTES,
                 logging_level=logging.WARNING,
                 log_to_driver=False,
@@ -85,7 +92,7 @@ def _join(address: str) -> None:
         if address != "auto" and os.environ.get("RAY_USE_TLS", "0") == "0":
             with grpc.insecure_channel(host, [("grpc.enable_http_proxy", 0)]) as channel:
                 grpc.channel_ready_future(channel).result(SECONDS_TO_ANSWER)
-        ray.init(address, logging_level=logging.WARNING)
+        ray.init(address, job_config=_job_config(), logging_level=logging.WARNING)
     except grpc.FutureTimeoutError:
         raise UserError(f"RAY_ADDRESS: got {address}, where no Ray answers; {wanted}") from None
     except (ConnectionError, RuntimeError, ValueError, RayError) as error:
@@ -97,6 +104,17 @@ def cpus() -> int:
     import ray
 
     return max(1, int(ray.cluster_resources().get("CPU", 1)))
+
+
+def _job_config() -> "JobConfig":
+    """Return a job whose workers import from the working directory only if this process does.
+
+    Ray would always have them do so: the code that lies in somebody else's folder would run where she is only read.
+    """
+    from ray.job_config import JobConfig
+
+    own = Path.cwd() in [Path(path).absolute() for path in sys.path]
+    return JobConfig(_client_job=not own)  # as though its client were on another machine
 
 
 def _secure_local_cluster() -> None:

@@ -58,7 +58,7 @@ def keeping_failures(
             versions=library_versions(),
         )
         write_file(path, failure.model_dump_json(indent=1) + "\n")
-        raise RunError(f"{error}\nto do it again, alone: python -m services.reproduce {path}") from error
+        raise RunError(f"{error}\nto do it again, alone: dmil reproduce {path}") from error
 
 
 def read_failure(path: Path) -> Failure:

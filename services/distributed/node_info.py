@@ -97,7 +97,9 @@ def cluster_facts(runs: Path, mark: str) -> tuple[list[NodeFacts], list[str]]:
 def _drawing() -> tuple[str, bool]:
     """Return the backend of OpenGL, or what is wrong with it: found by a process of its own, for it may crash."""
     command = "from services.suites.rendering import working_backend; print(working_backend())"
-    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True)
+    paths = os.pathsep.join(map(os.path.abspath, sys.path))  # with -P none that this process does not have
+    environment = os.environ | {"PYTHONPATH": paths}
+    done = subprocess.run([sys.executable, "-P", "-c", command], env=environment, capture_output=True, text=True)
     lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
     return (lines[-1] if lines else f"ended with {done.returncode}"), done.returncode == 0
 

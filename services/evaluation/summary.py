@@ -12,6 +12,7 @@ from rich.table import Table
 
 from dmil_core.settings import MethodConfig
 from dmil_core.statistics import interval_text, mean_score, share_entropy, success_rate
+from services.cli.escapes import for_markdown
 from services.evaluation.paper_results import Published, figure_of
 from services.evaluation.results import AdaptationResult, EpisodeResult
 from services.storage.checkpoints import Checkpoint
@@ -234,7 +235,7 @@ def table_markdown(summary: Summary) -> str:
         head = ["task", *(f"{cell.shots}-shot" for cell in cells)]
         tasks = ([task, *(_of_task(cell, task) for cell in cells)] for task in sorted(cells[0].per_task))
         lines += ["", *markdown_rows(head, tasks)]
-    return f"Success rates of {described(summary)}.\n\n" + "\n".join(lines) + "\n"
+    return f"Success rates of {for_markdown(described(summary))}.\n\n" + "\n".join(lines) + "\n"
 
 
 def described(summary: Summary) -> str:
@@ -277,9 +278,9 @@ def _of_task(cell: SummaryRow, task: str) -> str:
 
 
 def markdown_rows(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Return the lines of a table in Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return [f"| {' | '.join(field.replace('|', '/') for field in fields)} |" for fields in lines]
+    """Return the lines of a table in Markdown; its fields are plain text, but for ``<br>``."""
+    lines = [["<br>".join(map(for_markdown, field.split("<br>"))) for field in fields] for fields in (head, *rows)]
+    return [f"| {' | '.join(fields)} |" for fields in (lines[0], ["---"] * len(head), *lines[1:])]
 
 
 def write_summary(summary: Summary, path: Path) -> None:

@@ -87,7 +87,7 @@ def _model_of(client: "MlflowClient", checkpoint: Checkpoint) -> "LoggedModel":
     raise UserError(
         f"--checkpoint: got {checkpoint.path}, {got}; wanted the last checkpoint of a finished run of "
         "services.meta_train; what MLflow did not take while the run was on it takes by: "
-        f"python -m services.tracking flush {home}"
+        f"dmil tracking flush {home}"
     )
 
 

@@ -40,7 +40,7 @@ class FinishedRun(EvaluationFolder):
                 if (begun / BEGUN).is_file():
                     raise UserError(
                         f"RUN: got {begun}, which has not come to its end; wanted a finished run, with a {MARK}; go on "
-                        f"with it: python -m services.meta_train --resume {begun}"
+                        f"with it: dmil meta-train --resume {begun}"
                     ) from error
             raise
         if not (folder / CHECKPOINTS).is_dir():
@@ -62,7 +62,7 @@ class FinishedRun(EvaluationFolder):
         Raises:
             UserError: if the file is not as a run writes it.
         """
-        advice = f"write it again: python -m services.meta_train --resume {self.folder}"
+        advice = f"write it again: dmil meta-train --resume {self.folder}"
         return read_json(self.folder / MARK, Summary, MOST_BYTES, f"wanted what a run writes at its end; {advice}")
 
     @cached_property

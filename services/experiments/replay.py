@@ -107,7 +107,7 @@ class Replay:
         if checkpoint.digest != row.checkpoint:
             raise ReplayError(
                 f"{checkpoint.path}: got the digest {checkpoint.digest[:12]}; the episodes are of "
-                f"{row.checkpoint[:12]}; evaluate the run's end: python -m services.meta_train --resume {run.folder}"
+                f"{row.checkpoint[:12]}; evaluate the run's end: dmil meta-train --resume {run.folder}"
             )
         method = checkpoint.method(run.experiment.suite.action_dim)
         fine_tuning = FineTuning(row.fine_tuning_steps, row.learning_rate)

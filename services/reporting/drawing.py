@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup, escape
-from matplotlib import rc_context
+from matplotlib import rc_context, style
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -38,6 +38,7 @@ STYLE: dict[Any, Any] = {
     "grid.alpha": 0.2,
     "font.size": 9.0,
     "axes.titlesize": 10.0,
+    "text.parse_math": False,  # names are text
 } | dict.fromkeys(
     ("text.color", "axes.labelcolor", "axes.edgecolor", "axes.titlecolor", "xtick.color", "ytick.color", "grid.color"),
     INK,
@@ -92,7 +93,8 @@ def panels(
 
     It is no figure of pyplot's, so that no backend is set for a process that draws in windows of its own.
     """
-    with rc_context(STYLE):
+    # Whatever a matplotlibrc in the working directory says.
+    with style.context("default"), rc_context(STYLE):
         figure = Figure((width, height), layout="constrained")
         yield figure, list(figure.subplots(rows, columns, squeeze=False).flat)
 

@@ -22,8 +22,8 @@ def origin_of_run(finished: FinishedRun) -> Section:
         Commands(
             "To evaluate its last checkpoint again, and to write this page again",
             [
-                f"python -m services.evaluate --checkpoint {checkpoint} --output evaluation",
-                f"python -m services.report run {folder}",
+                f"dmil evaluate --checkpoint {checkpoint} --output evaluation",
+                f"dmil report run {folder}",
             ],
         ),
         Prose(
@@ -73,7 +73,7 @@ def episodes_of_run(finished: FinishedRun) -> Section:
         ]
         for row in rows[:MOST_ROWS]
     ]
-    pattern = f"python -m services.report video {folder} --task TASK --shots SHOTS --episode EPISODE"
+    pattern = f"dmil report video {folder} --task TASK --shots SHOTS --episode EPISODE"
     parts: list[Part] = [Commands("To see one", [pattern])]
     if len(rows) > MOST_ROWS:
         path = finished.folder / "episodes.jsonl"

@@ -47,7 +47,7 @@ def table_of_all(finished: FinishedRun) -> list[Part]:
         parts.append(
             Prose(
                 f"Warning: the run was trained on since: the figures are those of {summary.checkpoint}, its last "
-                f"checkpoint is {finished.checkpoint.path}. To evaluate that: python -m services.meta_train --resume "
+                f"checkpoint is {finished.checkpoint.path}. To evaluate that: dmil meta-train --resume "
                 f"{finished.folder}"
             )
         )

@@ -91,10 +91,7 @@ def name_of(row: EpisodeResult) -> str:
 
 def command(finished: FinishedRun, row: EpisodeResult) -> str:
     """Return the command line that films an episode."""
-    return (
-        f"python -m services.report video {finished.folder} --task {row.task} --shots {row.shots} "
-        f"--episode {row.episode}"
-    )
+    return f"dmil report video {finished.folder} --task {row.task} --shots {row.shots} --episode {row.episode}"
 
 
 def camera_of(finished: FinishedRun) -> str | View:

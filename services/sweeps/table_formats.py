@@ -12,6 +12,7 @@ from rich.table import Table
 
 from dmil_core.statistics import interval_text
 from services.cli.arguments import parse
+from services.cli.escapes import for_csv, for_latex, for_markdown, one_line
 from services.cli.progress import console
 from services.evaluation.comparison import DIGITS, Cell, Difference, Unpaired
 from services.evaluation.summary import markdown_rows
@@ -71,6 +72,11 @@ def _head(tables: Tables) -> str:
     trials = ", ".join(f"{count} {status}" for status, count in tables.trials.items())
     against = f"; beside it {tables.paper.replace('table', 'Table ')} of the paper" if tables.paper else ""
     return f"{tables.what}: {tables.metric.replace('_', ' ')} at preset {tables.preset}{against} (trials: {trials})"
+
+
+def _origin(tables: Tables) -> str:
+    """Return what a table is of, and the command that made it, as a comment has it."""
+    return one_line(f"{_head(tables)}; {tables.command}")
 
 
 def show(tables: Tables, sweep: SweepFolder) -> None:
@@ -135,7 +141,7 @@ def write_tables(sweep: SweepFolder) -> Tables:
     write_file(folder / "table.tex", _latex(tables))
     if tables.samples:
         best = yaml.safe_dump(tables.samples[0].settings, sort_keys=False)
-        write_file(folder / "best.yaml", f"# {_head(tables)}; {tables.command}\n{best}")
+        write_file(folder / "best.yaml", f"# {_origin(tables)}\n{best}")
     if tables.cells:
         draw_means(comparison, folder / "table.png", _head(tables))
     write_sweep_page(tables, comparison, folder / "report.html")
@@ -155,13 +161,15 @@ def _csv(rows: Sequence[Mapping[str, object]]) -> str:
         writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         for row in rows:
-            writer.writerow({key: " ".join(map(str, v)) if isinstance(v, list) else v for key, v in row.items()})
+            fields = {key: " ".join(map(str, v)) if isinstance(v, list) else v for key, v in row.items()}
+            writer.writerow({key: for_csv(value) for key, value in fields.items()})
     return text.getvalue()
 
 
 def _markdown(tables: Tables) -> str:
     digits, grid = DIGITS[tables.metric], _grid(tables)
-    lines = [_head(tables) + ".", "", f"Begun {tables.began}, commit {tables.commit[:12]}: `{tables.command}`", ""]
+    begun = for_markdown(f"Begun {tables.began}, commit {tables.commit[:12]}: {tables.command}")
+    lines = [f"{for_markdown(_head(tables))}.", "", begun, ""]
     if tables.samples:
         lines += markdown_rows(SAMPLE, map(_sample_fields, tables.samples))
     else:
@@ -177,14 +185,9 @@ def _markdown(tables: Tables) -> str:
     if tables.differences:
         lines += ["", "On the same seeds and episodes:", ""]
         lines += markdown_rows(DIFFERENCE, (_difference_fields(pair, digits) for pair in tables.differences))
-    lines += [f"\n{_not_compared(pair)}" for pair in tables.unpaired]
-    lines += [f"\nFailed: {name}: {' '.join(error.split())}" for name, error in tables.failed.items()]
+    lines += [f"\n{for_markdown(_not_compared(pair))}" for pair in tables.unpaired]
+    lines += [f"\n{for_markdown(f'Failed: {name}: {error}')}" for name, error in tables.failed.items()]
     return "\n".join(lines) + "\n"
-
-
-_TEX = str.maketrans(
-    {c: f"\\{c}" for c in "&%$#_{}"} | {"\\": r"\textbackslash{}", "λ": r"$\lambda$", "σ": r"$\sigma$"}
-)
 
 
 def _latex(tables: Tables) -> str:
@@ -192,14 +195,14 @@ def _latex(tables: Tables) -> str:
     digits, grid = DIGITS[tables.metric], _grid(tables)
 
     def stacked(lines: list[str]) -> str:
-        return r"\shortstack{" + r" \\ ".join(line.translate(_TEX) for line in lines) + "}" if lines else ""
+        return r"\shortstack{" + r" \\ ".join(map(for_latex, lines)) + "}" if lines else ""
 
-    lines = [f"% {_head(tables)}; {tables.command}", rf"\begin{{tabular}}{{l{'c' * len(tables.columns)}}}", r"\toprule"]
+    lines = [f"% {_origin(tables)}", rf"\begin{{tabular}}{{l{'c' * len(tables.columns)}}}", r"\toprule"]
     head = [stacked(column.split(", ")) for column in tables.columns]
     lines += [" & ".join(["", *head]) + r" \\", r"\midrule"]
     for row in tables.rows:
         fields = [stacked(_mean_and_paper(grid[row].get(column), digits)) for column in tables.columns]
-        lines.append(" & ".join([row.translate(_TEX), *fields]) + r" \\")
+        lines.append(" & ".join([for_latex(row), *fields]) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 

@@ -99,9 +99,7 @@ def _flush(delivery: Delivery, folder: Path, uri: str) -> None:
 def _report(folder: Path, uri: str) -> None:
     """Record the folder with the report of a run that is over once more, and deliver it."""
     if not (folder / REPORT).is_dir():
-        raise UserError(
-            f"RUN: got {folder}, which has no folder {REPORT}; wanted a finished run: python -m services.report run"
-        )
+        raise UserError(f"RUN: got {folder}, which has no folder {REPORT}; wanted a finished run: dmil report run")
     delivery = Delivery(folder, uri)
     try:
         _flush(delivery, folder, uri)  # nobody else delivers, and so records, from here on

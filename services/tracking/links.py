@@ -42,7 +42,7 @@ def ui_command(uri: str) -> str | None:
     """Return the command that serves the pages of an MLflow that is a file, or None of one that serves them itself."""
     if not uri.startswith("sqlite"):
         return None
-    return f"{'' if uri == DEFAULT_URI else f'MLFLOW_TRACKING_URI={shlex.quote(uri)} '}python -m services.tracking ui"
+    return f"{'' if uri == DEFAULT_URI else f'MLFLOW_TRACKING_URI={shlex.quote(uri)} '}dmil tracking ui"
 
 
 def artifacts_beside(uri: str) -> Path | None:

@@ -164,7 +164,7 @@ class Tracker:
         if left:
             logger.warning(
                 f"{left} of {self._spool.count} MLflow records wait in {self._spool.path}; when MLflow answers again: "
-                f"python -m services.tracking flush {self._folder}"
+                f"dmil tracking flush {self._folder}"
             )
         return not left
 

@@ -58,7 +58,7 @@ def test_a_run_from_end_to_end(programs, workplace: Path, data, mlflow_file: str
     for place in ("checkpoint: runs/whole/checkpoints/iteration-0000020", "report: runs/whole/report/report.html"):
         assert place in printed
     assert f"MLflow run: {summary['mlflow_run_id']} at {mlflow_file}" in printed
-    assert f"to look at it: MLFLOW_TRACKING_URI={mlflow_file} python -m services.tracking ui" in printed
+    assert f"to look at it: MLFLOW_TRACKING_URI={mlflow_file} dmil tracking ui" in printed
     assert "its page: http://127.0.0.1:5000/#/experiments/" in printed
     assert "meta-training 20/20" in printed
     page = (folder / "report" / "report.html").read_text()

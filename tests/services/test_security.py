@@ -127,7 +127,7 @@ def test_a_run_on_ray_lets_nobody_in_and_keeps_its_secrets_when_it_fails(
     assert "Traceback" in printed
     assert "ZeroDivisionError: made to fail" in printed
     assert "MLflow at http://...@127.0.0.1" in printed
-    assert "python -m services.tracking flush runs/run" in printed
+    assert "dmil tracking flush runs/run" in printed
     if let_in is not None:
         assert let_in.doors == []
         assert let_in.ports > 5

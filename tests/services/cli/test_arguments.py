@@ -1,5 +1,6 @@
 """Settings from preset, file and flags, and mistakes that are answered with what is allowed."""
 
+import shutil
 import subprocess
 import sys
 from contextlib import suppress
@@ -142,11 +143,47 @@ def test_each_program_explains_itself(name: str, capsys: pytest.CaptureFixture[s
     assert f"usage: python -m services.{name} " in capsys.readouterr().out
 
 
-def test_the_console_script_lists_the_programs():
-    dmil = Path(sys.executable).with_name("dmil")
-    listed = subprocess.run([dmil, "--help"], capture_output=True, text=True)
+SHADOWED = (
+    "argparse", "colorsys", "gymnasium", "h5py", "imageio", "metaworld", "minari", "mujoco", "numpy", "ray", "services",
+    "sklearn", "torch", "tyro", "yaml",
+)  # fmt: skip
+
+
+@pytest.fixture
+def foreign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Somebody else's folder, as the working directory: modules in it write their names into the file that ran."""
+    folder, ran = tmp_path / "foreign", tmp_path / "ran"
+    information = folder / "foreign-1.0.dist-info"
+    information.mkdir(parents=True)
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: foreign\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text("[dmil.suites]\nml10 = colorsys:Suite\n")
+    for name in SHADOWED:
+        (folder / f"{name}.py").write_text(f"open({str(ran)!r}, 'a').write('{name} ')")
+    monkeypatch.chdir(folder)
+    return ran
+
+
+def dmil(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([Path(sys.executable).with_name("dmil"), *arguments], capture_output=True, text=True)
+
+
+def test_the_console_script_lists_the_programs(foreign: Path):
+    listed = dmil("--help")
     assert listed.returncode == 0
     assert all(name in listed.stdout for name in PROGRAMS)
-    unknown = subprocess.run([dmil, "fly"], capture_output=True, text=True)
+    unknown = dmil("fly")
     assert unknown.returncode == 2
     assert "got the program 'fly'; wanted one of meta-train" in unknown.stderr
+    assert not foreign.exists()
+
+
+@pytest.mark.thorough
+def test_the_console_script_runs_nothing_of_the_folder_it_is_called_in(foreign: Path, finished):
+    shutil.copytree(finished.folder, ".", dirs_exist_ok=True)
+    drawn = dmil("report", "run", ".")
+    assert drawn.returncode == 0, drawn.stderr
+    verified = dmil("collect-demos", "verify", "--tasks", "reach", "--seeds", "1", "--workers", "1")  # by Ray's workers
+    assert verified.returncode == 0, verified.stderr
+    checked = dmil("doctor")
+    assert checked.returncode in (0, 1), checked.stderr
+    assert not foreign.exists(), foreign.read_text()

@@ -228,7 +228,7 @@ def test_an_error_is_reported_with_the_command_that_repeats_it(
     assert "Traceback" not in said
     assert "iteration 3, slot " in said
     assert "task push, seed 0: ArithmeticError: out of numbers" in said
-    command = said.strip().splitlines()[-1].partition("python -m services.reproduce ")[2]
+    command = said.strip().splitlines()[-1].partition("dmil reproduce ")[2]
     assert command == "runs/run/failure.json"
     failure = read_failure(Path(command))
     assert failure.piece["iteration"] == 2
@@ -282,7 +282,7 @@ def test_a_failing_expert_and_a_failing_trial_are_named(
         assert exit_code(meta_train.run, arguments) == 1
     said = capsys.readouterr().err
     assert "task reach, attempt 0, seed " in said
-    assert f"python -m services.reproduce {workplace / 'data' / 'failure.json'}" in said
+    assert f"dmil reproduce {workplace / 'data' / 'failure.json'}" in said
     reproduce.run([str(workplace / "data")])
 
 

@@ -80,7 +80,7 @@ def test_it_says_what_the_run_is_made_of_and_how_to_have_it_again(finished: Fini
         "--training.checkpoint-every 2 --evaluation.shots 1 2 --evaluation.fine-tuning-steps 1 --evaluation.every 2"
     )
     assert f"--checkpoint {finished.checkpoint.path}" in evaluate
-    assert page == f"python -m services.report run {finished.folder}"
+    assert page == f"dmil report run {finished.folder}"
     assert finished.origin.commits[0] in prose(section)
     assert finished.summary.checkpoint_digest in prose(section)
     manifest = finished.checkpoint.manifest

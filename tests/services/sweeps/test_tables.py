@@ -204,6 +204,14 @@ def test_a_search_is_ranked_and_its_best_is_a_file_of_settings(tmp_path: Path) -
     assert text.index("sample 2") < text.index("sample 1") < text.index("sample 0")
 
 
+def test_a_sweep_s_title_stays_in_its_comment(tmp_path: Path) -> None:
+    sweep = make(tmp_path, better, what="$a$\n\\input{/etc/passwd}\nseed: 1")
+    write_tables(sweep)
+    first, *others = (sweep.path / "tables" / "table.tex").read_text().splitlines()
+    assert first.startswith("% $a$ \\input{/etc/passwd} seed: 1: ")
+    assert "input" not in "".join(others)
+
+
 def test_report_tables_finds_a_sweep_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str], complaint) -> None:
     make(tmp_path, better)
     report.run(["tables", "made-up", "--runs", str(tmp_path)])

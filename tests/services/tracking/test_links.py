@@ -27,8 +27,8 @@ def test_links_lead_to_the_pages_of_the_server_or_of_mlflow_ui_without_secrets(u
 @pytest.mark.parametrize(
     ("uri", "command"),
     [
-        ("sqlite:///mlflow.db", "python -m services.tracking ui"),
-        ("sqlite:////a b/c.db", "MLFLOW_TRACKING_URI='sqlite:////a b/c.db' python -m services.tracking ui"),
+        ("sqlite:///mlflow.db", "dmil tracking ui"),
+        ("sqlite:////a b/c.db", "MLFLOW_TRACKING_URI='sqlite:////a b/c.db' dmil tracking ui"),
         ("http://127.0.0.1:5000", None),
     ],
 )

@@ -27,7 +27,7 @@ def test_with_no_server_training_ends_and_a_flush_delivers(
     assert checkpoint.manifest.mlflow_run_id is None
     assert printed.count("does not take records") == 1
     assert printed.count(f"{count} of {count} MLflow records wait in runs/run/tracking.jsonl") == 1
-    assert printed.count("python -m services.tracking flush runs/run") == 1
+    assert printed.count("dmil tracking flush runs/run") == 1
     done = [measured.step for measured in records(folder, "metrics") if "gradient_norm" in measured.values]
     assert done == [1, 2, 3]
     assert {line.kind for line in read_spool(folder / "tracking.jsonl")} == {
