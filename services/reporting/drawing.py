@@ -112,4 +112,5 @@ def drawn(figure: Figure, title: str, description: str) -> Picture:
     head = f'role="img" aria-labelledby="{prefix}title {prefix}description"'
     texts = f'<title id="{prefix}title">{escape(title)}</title>'
     texts += f'<desc id="{prefix}description">{escape(description)}</desc>'
-    return Picture(title, description, Markup(re.sub(r"<svg ([^>]*)>", rf"<svg {head} \1>" + texts, svg, count=1)))
+    opening, content = svg.split(">", 1)
+    return Picture(title, description, Markup(f"{opening} {head}>{texts}{content}"))

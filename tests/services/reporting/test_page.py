@@ -2,6 +2,7 @@ import re
 from pathlib import Path
 
 import imageio.v3 as imageio
+import matplotlib
 import numpy as np
 import pytest
 
@@ -88,3 +89,10 @@ def test_a_sub_skill_keeps_its_colour_and_lines_differ_beyond_the_colours():
     assert len(set(COLOURS)) == 10
     assert colour_of(3) == colour_of(13) == COLOURS[3]
     assert style_of(3) != style_of(13)
+
+
+def test_a_name_in_a_picture_is_text(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(matplotlib.rcParams, "text.usetex", True)  # as a matplotlibrc in the working directory might
+    svg = str(lines(r"$\input{/etc/passwd}^2$ <script>").svg)
+    assert svg.count(r"$\input{/etc/passwd}^2$ &lt;script&gt;</text>") == 2
+    assert "<script" not in svg
