@@ -28,11 +28,7 @@ Network: TypeAlias = tuple[Layer, ...]
 
 
 def initialise(
-    prefix: str,
-    sizes: Sequence[int],
-    rng: np.random.Generator,
-    copies: int | None = None,
-    output_scale: float = 1.0,
+    prefix: str, sizes: Sequence[int], rng: np.random.Generator, copies: int | None = None, output_scale: float = 1.0
 ) -> Parameters:
     """Draw the parameters of a perceptron: He-uniform weights (He et al. 2015), zero biases.
 

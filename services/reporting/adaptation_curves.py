@@ -112,11 +112,7 @@ def measure(
 
 
 def _planned(
-    run: FinishedRun,
-    tasks: Sequence[str] | None,
-    shots: Sequence[int],
-    steps: Sequence[int] | None,
-    episodes: int,
+    run: FinishedRun, tasks: Sequence[str] | None, shots: Sequence[int], steps: Sequence[int] | None, episodes: int
 ) -> CurvePlan:
     known, evaluation_of_run = [task for _, task in run.experiment.tasks], run.config.evaluation
     wanted = tuple(dict.fromkeys(tasks or run.experiment.suite.test_tasks[:MOST_TASKS]))

@@ -64,11 +64,7 @@ PICTURES: Mapping[str, Sequence[Panel]] = {
         Panel("success in practice", "success rate", ("practice_success",)),
         Panel("reward", "reward of a step in nats", ("reward",)),
         Panel("discriminator's loss", "cross-entropy in nats", ("discriminator_loss",)),
-        Panel(
-            "discriminator",
-            "fraction",
-            ("discriminator_accuracy", "discriminator_expert", "discriminator_pseudo"),
-        ),
+        Panel("discriminator", "fraction", ("discriminator_accuracy", "discriminator_expert", "discriminator_pseudo")),
         Panel("way of an improvement", "divergence in nats", ("high_divergence", "low_divergence")),
         Panel("entropy of the high level", "nats", ("option_entropy",)),
         Panel("critic", "squared error", ("value_error",)),

@@ -81,12 +81,7 @@ def sub_skill_gradients(low: Sequence[Network], steps: Steps, chosen: Int[Tensor
 
 
 def inner_loop(
-    hierarchy: Hierarchy,
-    support_high: Steps,
-    support_low: Steps,
-    config: DmilConfig,
-    *,
-    keep: bool = False,
+    hierarchy: Hierarchy, support_high: Steps, support_low: Steps, config: DmilConfig, *, keep: bool = False
 ) -> Iterator[InnerStep]:
     """Yield the steps of the dual inner loop, without end (Algorithm 1); `hierarchy` stays unchanged.
 
@@ -122,12 +117,7 @@ def inner_loop(
 
 
 def adapt(
-    hierarchy: Hierarchy,
-    support_high: Steps,
-    support_low: Steps,
-    config: DmilConfig,
-    *,
-    steps: int,
+    hierarchy: Hierarchy, support_high: Steps, support_low: Steps, config: DmilConfig, *, steps: int
 ) -> Hierarchy:
     """Return the networks after `steps` steps of the `inner_loop`."""
     for step in itertools.islice(inner_loop(hierarchy, support_high, support_low, config), steps):

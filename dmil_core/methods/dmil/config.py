@@ -49,14 +49,7 @@ class DmilConfig(HierarchicalConfig, NetworkConfig, WindowConfig):
                 "order": "first",
                 "trajectories": 4,
                 "window": 24,
-            },
+            }
         },
-        "smoke": {
-            "method": {
-                **SMOKE_NETWORK,
-                "inner_learning_rate": 1e-2,
-                "trajectories": 2,
-                "window": 24,
-            },
-        },
+        "smoke": {"method": {**SMOKE_NETWORK, "inner_learning_rate": 1e-2, "trajectories": 2, "window": 24}},
     }

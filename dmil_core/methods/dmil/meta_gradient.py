@@ -8,13 +8,7 @@ import torch
 from dmil_core.loss_gradients import LossGradient
 from dmil_core.losses import Steps, bank_errors, sub_skill_labels
 from dmil_core.methods.base import TaskGradient
-from dmil_core.methods.dmil.adaptation import (
-    Hierarchy,
-    choose,
-    high_level_gradient,
-    inner_loop,
-    sub_skill_gradients,
-)
+from dmil_core.methods.dmil.adaptation import Hierarchy, choose, high_level_gradient, inner_loop, sub_skill_gradients
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.dmil.losses import continuity_loss, targets_of
 from dmil_core.networks import Parameters, zeros_like

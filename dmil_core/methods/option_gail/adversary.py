@@ -102,10 +102,7 @@ def discriminate(
     with torch.no_grad():
         of_policy = (discriminator_logits(moved, batch, k) > 0).float().mean().item()
         of_expert = (discriminator_logits(moved, expert, k) < 0).float().mean().item()
-    return {
-        "discriminator_loss": float(np.mean(losses)),
-        "discriminator_accuracy": (of_policy + of_expert) / 2,
-    }
+    return {"discriminator_loss": float(np.mean(losses)), "discriminator_accuracy": (of_policy + of_expert) / 2}
 
 
 def _minibatches(count: int, size: int, passes: int, generator: torch.Generator) -> Iterator[Int[Tensor, " _"]]:

@@ -40,11 +40,7 @@ class OptionGailOfflineConfig(OptionConfig):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "paper": {"evaluation": {"learning_rate": 3e-4}},
         "quick": {
-            "method": {
-                **QUICK_NETWORK,
-                "trajectories": 4,
-                "likelihood_iterations": 500,
-            },
+            "method": {**QUICK_NETWORK, "trajectories": 4, "likelihood_iterations": 500},
             "evaluation": {"learning_rate": 1e-3},
         },
         "smoke": {

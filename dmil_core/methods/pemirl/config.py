@@ -37,13 +37,7 @@ class PemirlConfig(NetworkConfig):
     """Context m of the discriminator's negatives: same as the expert's, as in the original; mismatched: of N(0, 1)."""
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        "quick": {
-            "method": {
-                **QUICK_NETWORK,
-                "trajectories": 8,
-                "steps_per_trajectory": 32,
-            },
-        },
+        "quick": {"method": {**QUICK_NETWORK, "trajectories": 8, "steps_per_trajectory": 32}},
         "smoke": {
             "method": {
                 **SMOKE_NETWORK,
@@ -51,6 +45,6 @@ class PemirlConfig(NetworkConfig):
                 "trajectories": 4,
                 "contexts": 2,
                 "steps_per_trajectory": 24,
-            },
+            }
         },
     }
