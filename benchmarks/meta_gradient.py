@@ -49,16 +49,16 @@ class Arguments(BenchmarkArguments):
     """How often each is timed; the table shows medians."""
 
 
-Place: TypeAlias = tuple[int, tuple[int, ...], tuple[int, ...]]
+Layout: TypeAlias = tuple[int, tuple[int, ...], tuple[int, ...]]
 """Where a matrix lies in memory: address, shape and strides."""
 
 
 class Product(NamedTuple):
     """A matrix product."""
 
-    left: Place
-    right: Place
-    result: Place
+    left: Layout
+    right: Layout
+    result: Layout
     added: bool
     """Whether it is added to what the result holds."""
 
@@ -75,8 +75,8 @@ class ProductRecorder(TorchDispatchMode):
         name = func.overloadpacket.__name__
         if name in ("mm", "addmm", "addmm_"):
             matrices = (*args[-2:], result)
-            places = ((matrix.data_ptr(), tuple(matrix.shape), matrix.stride()) for matrix in matrices)
-            self.products.append(Product(*places, added=name == "addmm_"))
+            layouts = ((matrix.data_ptr(), tuple(matrix.shape), matrix.stride()) for matrix in matrices)
+            self.products.append(Product(*layouts, added=name == "addmm_"))
         return result
 
 
@@ -102,14 +102,14 @@ class Worker:
         """Note the matrix products, lay out their operands, and return their floating-point operations."""
         with ProductRecorder() as recorder:
             self.gradients()
-        operands: dict[Place, Tensor] = {}
+        operands: dict[Layout, Tensor] = {}
 
-        def operand(place: Place) -> Tensor:
-            _, (rows, columns), stride = place
-            if place not in operands:
+        def operand(layout: Layout) -> Tensor:
+            _, (rows, columns), stride = layout
+            if layout not in operands:
                 extent = (rows - 1) * stride[0] + (columns - 1) * stride[1] + 1
-                operands[place] = torch.randn(extent).as_strided((rows, columns), stride)
-            return operands[place]
+                operands[layout] = torch.randn(extent).as_strided((rows, columns), stride)
+            return operands[layout]
 
         self.products = [
             (operand(product.left), operand(product.right), operand(product.result), product.added)

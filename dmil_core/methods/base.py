@@ -89,7 +89,7 @@ class FineTuning(NamedTuple):
 
 
 Config = TypeVar("Config", bound=MethodConfig)
-Own = TypeVar("Own", bound="Method[Any]")
+M = TypeVar("M", bound="Method[Any]")
 
 
 @dataclass(frozen=True)
@@ -104,14 +104,14 @@ class Method(ABC, Generic[Config]):
     """Class of the settings, whose default name is the method's."""
 
     @classmethod
-    def prepared(cls: type[Own], config: Config, action_dim: int, demonstrations: Sequence[Demonstration]) -> Own:
+    def prepared(cls: type[M], config: Config, action_dim: int, demonstrations: Sequence[Demonstration]) -> M:
         """Return the method with the observation statistics of all meta-training demonstrations."""
         if config.standardise:
             return cls(config, action_dim, Normalisation.of(demonstrations))
         return cls(config, action_dim, Normalisation.identity(demonstrations[0].observations.shape[1]))
 
     @classmethod
-    def restored(cls: type[Own], config: Config, action_dim: int, constants: Mapping[str, np.ndarray]) -> Own:
+    def restored(cls: type[M], config: Config, action_dim: int, constants: Mapping[str, np.ndarray]) -> M:
         """Return the method whose `constants` were stored."""
         return cls(config, action_dim, Normalisation(constants["observation_mean"], constants["observation_scale"]))
 

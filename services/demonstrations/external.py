@@ -96,7 +96,7 @@ def demonstrations(task: str, place: str, suite: TaskSuite, most: int) -> TaskDe
         DemonstrationError: names the episode that cannot be learned from, or the dimensions that do not fit.
     """
     state_of = getattr(suite, "state_of", lambda observations: observations)
-    found = []
+    kept = []
     for index, episode in enumerate(read_episodes(place)[:most]):
         try:
             observations = np.ascontiguousarray(state_of(episode.observations), np.float32)
@@ -104,8 +104,8 @@ def demonstrations(task: str, place: str, suite: TaskSuite, most: int) -> TaskDe
             check_dimensions(demonstration, suite)
         except DemonstrationError as error:
             raise DemonstrationError(f"{place}: episode {index}: {error}") from error
-        found.append(demonstration)
-    return TaskDemonstrations(place, tuple(found), 0, digest(found))
+        kept.append(demonstration)
+    return TaskDemonstrations(place, tuple(kept), 0, digest(kept))
 
 
 def check_dimensions(demonstration: Demonstration, suite: TaskSuite) -> None:

@@ -134,9 +134,9 @@ class Pool:
 
     def poll(self) -> None:
         """Process what has ended by now, without waiting, and start backups of slow calls."""
-        watched = [*self._running, *self._starting]
-        if watched:
-            ended, _ = ray.wait(watched, num_returns=len(watched), timeout=0, fetch_local=False)
+        calls = [*self._running, *self._starting]
+        if calls:
+            ended, _ = ray.wait(calls, num_returns=len(calls), timeout=0, fetch_local=False)
             for reference in ended:
                 if reference in self._starting:
                     self._finish_start(reference)

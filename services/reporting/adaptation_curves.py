@@ -22,11 +22,11 @@ from services.experiments.finished_run import FinishedRun
 from services.reporting.drawing import (
     Picture,
     colour_of,
-    drawn,
     legend_of_markers,
     marker_of,
     panels,
     scale_by_logarithms,
+    to_picture,
 )
 from services.reporting.page import DataTable, Part, Prose, Section
 from services.reporting.run_group import MOST_TASKS, policy_after
@@ -267,7 +267,7 @@ def _draw(measured: Sequence[Point]) -> Picture:
             axis.set_xlabel("fine-tuning steps, not to scale")
         legend_of_markers(figure, [f"{size}-shot" for size in sizes], "solid")
         text = "; ".join(f"{size}-shot {_course(measured, size)}" for size in sizes)
-        return drawn(figure, "Success and loss over fine-tuning steps", f"Bars are 95% Wilson intervals. {text}.")
+        return to_picture(figure, "Success and loss over fine-tuning steps", f"Bars are 95% Wilson intervals. {text}.")
 
 
 def _course(measured: Sequence[Point], shots: int) -> str:

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from services.reporting.drawing import DASHES, Picture, colour_of, drawn, panels, scale_by_logarithms
+from services.reporting.drawing import DASHES, Picture, colour_of, panels, scale_by_logarithms, to_picture
 
 Metrics = Sequence[Sequence[Mapping[str, float]]]
 """Of each seed: the metrics of each iteration, under ``iteration`` its number."""
@@ -96,7 +96,7 @@ def curves(title: str, rows: Mapping[str, Metrics], names: Mapping[str, str], *,
             axis.remove()
         figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=4, fontsize="small")
         ends = "; ".join(f"{words}: {', '.join(rows)}" for words, rows in texts.items())
-        return drawn(figure, title, f"{ends}.")
+        return to_picture(figure, title, f"{ends}.")
 
 
 def draw_curve(

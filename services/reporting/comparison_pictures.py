@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from dmil_core.seeding import named_rng
 from dmil_core.statistics import interquartile_mean, performance_profile, profile_band
 from services.evaluation.comparison import DIGITS, Cell, Comparison
-from services.reporting.drawing import DASHES, Picture, colour_of, drawn, ink_on, marker_of, panels
+from services.reporting.drawing import DASHES, Picture, colour_of, ink_on, marker_of, panels, to_picture
 
 APART = 0.17
 """Between two numbers of shots, in rows."""
@@ -33,7 +33,7 @@ def means(comparison: Comparison) -> Picture:
     text = "; ".join(f"{condition}: {', '.join(rows)}" for condition, rows in by_condition.items())
     hollow = "Hollow marks are the paper's figures. " if any(cell.paper for cell in comparison.cells) else ""
     with _means_figure(comparison) as figure:
-        return drawn(figure, f"Mean {metric} of each row; bars are 95% intervals", f"{hollow}{text}.")
+        return to_picture(figure, f"Mean {metric} of each row; bars are 95% intervals", f"{hollow}{text}.")
 
 
 def draw_means(comparison: Comparison, path: Path, title: str) -> None:
@@ -122,7 +122,7 @@ def heat_map(
         axis.grid(visible=False)
         axis.spines[:].set_visible(False)
         figure.colorbar(mesh, ax=axis, label=metric, fraction=0.05, pad=0.02, ticks=[0, top], format="%g")
-        return drawn(figure, title, _described(rows, tasks, values, digits))
+        return to_picture(figure, title, _described(rows, tasks, values, digits))
 
 
 def _described(rows: Sequence[str], tasks: Sequence[str], values: Float[np.ndarray, "tasks rows"], digits: int) -> str:
@@ -152,7 +152,7 @@ def profiles(where: str, rows: Sequence[str], by_shots: Mapping[int, Runs], metr
             axis.set(xlim=(-0.01 * top, 1.02 * top), ylim=(-0.02, 1.02))
             axis.legend(fontsize="small", title="interquartile mean", title_fontsize="small")
         title = f"Performance profile, {where}"
-        return drawn(figure, title, f"Higher is better. Interquartile means: {'; '.join(texts)}.")
+        return to_picture(figure, title, f"Higher is better. Interquartile means: {'; '.join(texts)}.")
 
 
 def _draw_profile(

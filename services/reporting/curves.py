@@ -12,7 +12,7 @@ from services.evaluation.results import EpisodeResult
 from services.evaluation.summary import summary_rows
 from services.experiments.finished_run import FinishedRun
 from services.reporting.bands import Curve, chunks_of, draw_curve
-from services.reporting.drawing import Picture, colour_of, drawn, marker_of, panels, style_of
+from services.reporting.drawing import Picture, colour_of, marker_of, panels, style_of, to_picture
 from services.reporting.page import Part, Prose, Section
 from services.suites.base import Split
 
@@ -21,7 +21,7 @@ Lines = dict[tuple[Split, int], list[tuple[int, float, float, float]]]
 """By split and shots: iteration, mean, and the ends of its interval."""
 SPLITS = ("meta-training", "meta-testing")
 SHARE = "sub_skill_share/"
-DRAWN = 50
+MOST_POINTS = 50
 """A curve goes through so many points at most, each the mean of as many iterations."""
 MIDDLE = (10, 90)
 """Percentiles of the iterations behind a point, between which the band lies."""
@@ -105,8 +105,8 @@ def training_curves(finished: FinishedRun) -> Section:
         parts += draw_success(finished.evaluations, finished.config.method, finished.best_score)
     if pictures := draw_metrics(finished.metrics):
         text = (
-            f"A curve goes through {DRAWN} points at most: each is the mean of as many iterations, and the band around "
-            f"it holds the middle {MIDDLE[1] - MIDDLE[0]}% of them."
+            f"A curve goes through {MOST_POINTS} points at most: each is the mean of as many iterations, and the band "
+            f"around it holds the middle {MIDDLE[1] - MIDDLE[0]}% of them."
         )
         parts += [Prose(text), *pictures]
     return Section("Training curves", parts)
@@ -142,7 +142,7 @@ def _words(name: str) -> str:
 
 def _curve(metrics: Metrics, name: str) -> Curve:
     rows = np.array([(row["iteration"], row[name]) for row in metrics if name in row])
-    chunks = [rows[places] for places in chunks_of(len(rows), DRAWN)]
+    chunks = [rows[places] for places in chunks_of(len(rows), MOST_POINTS)]
     low, high = np.transpose([np.percentile(chunk[:, 1], MIDDLE) for chunk in chunks])
     return Curve(np.array([chunk[-1, 0] for chunk in chunks]), np.array([c[:, 1].mean() for c in chunks]), low, high)
 
@@ -158,7 +158,7 @@ def _picture(title: str, filled: Mapping[Panel, Mapping[str, Curve]]) -> Picture
                 axis.set(yscale="linear", ylim=(0, 1.02))
         for axis in axes[len(filled) :]:
             axis.remove()
-        return drawn(figure, title, " ".join(_describe(panel, curves) for panel, curves in filled.items()))
+        return to_picture(figure, title, " ".join(_describe(panel, curves) for panel, curves in filled.items()))
 
 
 def _describe(panel: Panel, curves: Mapping[str, Curve]) -> str:
@@ -226,4 +226,5 @@ def _progress(title: str, what: str, best: int, lines: Lines) -> Picture:
                 )
             axis.set(title=split, xlabel="iteration", ylabel=what, ylim=(0, 1.03 * best))
             axis.legend(fontsize="small")
-        return drawn(figure, title, f"The {what} after so many iterations, with 95% intervals. {'; '.join(texts)}.")
+        text = f"The {what} after so many iterations, with 95% intervals. {'; '.join(texts)}."
+        return to_picture(figure, title, text)

@@ -99,7 +99,7 @@ def panels(
         yield figure, list(figure.subplots(rows, columns, squeeze=False).flat)
 
 
-def drawn(figure: Figure, title: str, description: str) -> Picture:
+def to_picture(figure: Figure, title: str, description: str) -> Picture:
     """Return a figure as inline SVG that has a size, a text alternative, and ids that no other picture has."""
     text = StringIO()
     figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})

@@ -10,7 +10,7 @@ from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.settings import sub_skills_of
 from services.cli.progress import Bar
 from services.reporting.choices import describe_shares, statistics
-from services.reporting.drawing import Picture, colour_of, drawn, legend_of_markers, marker_of, panels
+from services.reporting.drawing import Picture, colour_of, legend_of_markers, marker_of, panels, to_picture
 from services.reporting.page import Part, Prose, Section
 from services.reporting.run_group import RunGroup, has_sub_skills, policies
 
@@ -118,7 +118,7 @@ def _draw(group: RunGroup, task: str, shots: int, perplexity: float, seed: int) 
         most = max(panel.sub_skills for panel in policy_panels)
         legend_of_markers(figure, [f"sub-skill {k}" for k in range(most)])
         description = _describe(policy_panels, kept, len(support), len(others), perplexity, seed)
-        return drawn(figure, f"t-SNE of {task}", description)
+        return to_picture(figure, f"t-SNE of {task}", description)
 
 
 def _describe(panels: Sequence[_Panel], kept: Thinned, support: int, others: int, perplexity: float, seed: int) -> str:

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from services.evaluation.results import EpisodeResult
 from services.experiments.finished_run import FinishedRun
 from services.experiments.replay import Replay, ReplayedEpisode, ReplayError, replaying
-from services.reporting.drawing import Picture, colour_of, drawn, panels
+from services.reporting.drawing import Picture, colour_of, panels, to_picture
 from services.reporting.film import FORMS, video_settings, write_film
 from services.reporting.page import Clip, Commands, DataTable, Part, Prose, Section
 from services.reporting.video import camera_of, command, name_of, side_of
@@ -172,7 +172,7 @@ def draw_episodes(replayed: Sequence[ReplayedEpisode], measure: Measure, best_sc
             _describe_episodes(word, kinds[success], measure) for success, word in ((False, "failed"), (True, "solved"))
         )
         apart = "; equal scores are drawn a little apart" if scored else ""
-        return drawn(figure, title, f"A line is an episode; a cross or a dot is its end{apart}. {text}")
+        return to_picture(figure, title, f"A line is an episode; a cross or a dot is its end{apart}. {text}")
 
 
 def _describe_episodes(word: str, replayed: Sequence[ReplayedEpisode], measure: Measure) -> str:

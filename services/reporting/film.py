@@ -27,7 +27,7 @@ STRIP = 8
 """The height of the strip of all sub-skills so far."""
 GAP = 10
 """Between two sides."""
-HELD_SECONDS = 1.5
+LAST_PICTURE_SECONDS = 1.5
 """The last picture stays for so long."""
 LONGEST_SECONDS = 7.5
 """Longer films are sped up, by leaving out steps."""
@@ -78,7 +78,7 @@ def compose(sides: Sequence[Side], rate: int) -> Iterator[UInt8[np.ndarray, "hei
         height, width = (size + size % 2 for size in whole.shape[:2])
         picture = np.zeros((height, width, 3), np.uint8)
         picture[: whole.shape[0], : whole.shape[1]] = whole
-        for _ in range(int(HELD_SECONDS * rate) if time == length - 1 else 1):
+        for _ in range(int(LAST_PICTURE_SECONDS * rate) if time == length - 1 else 1):
             yield picture
 
 

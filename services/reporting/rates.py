@@ -7,7 +7,7 @@ from dmil_core.statistics import Mean, interval_text, mean_score, success_rate
 from services.evaluation.results import EpisodeResult
 from services.evaluation.summary import AGAINST_COLLAPSE, described, headline
 from services.experiments.finished_run import FinishedRun
-from services.reporting.drawing import INK, Picture, colour_of, drawn, panels
+from services.reporting.drawing import INK, Picture, colour_of, panels, to_picture
 from services.reporting.page import DataTable, Part, Prose, Section
 from services.suites.base import Split
 
@@ -108,7 +108,7 @@ def _bars(split: Split, by_task: Mapping[tuple[Split, int, str], Mean], what: st
             axis.grid(visible=False, axis="y")
         for axis in axes[len(by_shots) :]:
             axis.remove()
-        return drawn(figure, f"{split}: {what} of each task", _describe(by_shots, tasks, what))
+        return to_picture(figure, f"{split}: {what} of each task", _describe(by_shots, tasks, what))
 
 
 def _describe(by_shots: Mapping[int, Mapping[str, Mean]], tasks: Sequence[str], what: str) -> str:

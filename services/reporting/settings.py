@@ -23,13 +23,13 @@ class Nearest(NamedTuple):
 
 def nearest_preset(config: ExperimentConfig) -> Nearest:
     """Return the preset of a run's own suite and method that is nearest to its settings."""
-    own = _flat(config.model_dump())
-    found = []
+    settings = _flat(config.model_dump())
+    presets = []
     for size in BASE_PRESETS:
         preset = _flat(preset_of(config.suite.name, size, config.method.name).model_dump())
-        differing = {name: value for name, value in own.items() if name not in preset or preset[name] != value}
-        found.append(Nearest(size, preset, differing))
-    return min(found, key=lambda nearest: len(nearest.differing))
+        differing = {name: value for name, value in settings.items() if name not in preset or preset[name] != value}
+        presets.append(Nearest(size, preset, differing))
+    return min(presets, key=lambda nearest: len(nearest.differing))
 
 
 def flags(settings: Mapping[str, Any]) -> str:
@@ -38,11 +38,11 @@ def flags(settings: Mapping[str, Any]) -> str:
 
 
 def _flag(name: str, value: Any) -> list[str]:
-    section, dot, own = name.replace("_", "-").rpartition(".")
+    section, dot, field = name.replace("_", "-").rpartition(".")
     if isinstance(value, bool):
-        return [f"--{section}{dot}{own if value else f'no-{own}'}"]
+        return [f"--{section}{dot}{field if value else f'no-{field}'}"]
     values = value if isinstance(value, list | tuple) else [value]
-    return [f"--{section}{dot}{own}", *map(str, values)]
+    return [f"--{section}{dot}{field}", *map(str, values)]
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -238,8 +238,8 @@ def _curves(comparison: Comparison) -> list[Part]:
         "lowest seed to the highest. Over one seed a success rate's band is its 95% interval over episodes, and a loss "
         "has none. Losses of different methods are different things: compare their course, not their height."
     )
-    drawn = [picture for picture in pictures if picture is not None]
-    return [Prose(text), *drawn] if drawn else []
+    kept = [picture for picture in pictures if picture is not None]
+    return [Prose(text), *kept] if kept else []
 
 
 def _trained(comparison: Comparison, suite: str) -> dict[tuple[str, ...], list[SeedEvaluation]]:

@@ -8,7 +8,7 @@ from matplotlib.patches import Patch, PathPatch, Rectangle
 from matplotlib.path import Path as Outline
 
 from services.reporting.choices import Choices, Timeline, TimelineStatistics, describe_shares, segments
-from services.reporting.drawing import INK, Picture, colour_of, drawn, ink_on, legend_of_markers, marker_of, panels
+from services.reporting.drawing import INK, Picture, colour_of, ink_on, legend_of_markers, marker_of, panels, to_picture
 
 LEGIBLE = 0.05
 """A stretch gets its number, a bar its share, from this part of the width on."""
@@ -44,7 +44,7 @@ def draw_timelines(title: str, choices: Sequence[Choices], on: str, most: int) -
         names = _names(choices)
         patches = [Patch(color=colour_of(k)) for k in range(len(names))]
         figure.legend(patches, names, loc="outside lower center", ncols=min(len(names), 6), frameon=False)
-        return drawn(figure, title, _describe(choices, on))
+        return to_picture(figure, title, _describe(choices, on))
 
 
 def _draw_strip(axis: Axes, row: int, timeline: Timeline, sub_skills: int, longest: int) -> None:
@@ -96,7 +96,7 @@ def draw_usage(title: str, choices: Sequence[Choices], kinds: Sequence[str]) -> 
             "switches per episode"
             for choice, on, use in rows
         )
-        return drawn(figure, title, f"{text}.")
+        return to_picture(figure, title, f"{text}.")
 
 
 def _draw_shares(axis: Axes, row: int, use: TimelineStatistics) -> None:
@@ -131,7 +131,7 @@ def draw_transitions(title: str, choices: Sequence[Choices], on: str) -> Picture
             f"{choice.run} {choice.adaptation} adaptation: " + (_describe_kept(followed) or "no step follows another")
             for choice, followed in kept
         )
-        return drawn(figure, title, f"Fractions of each row; – where nothing follows. Followed by itself, {text}.")
+        return to_picture(figure, title, f"Fractions of each row; – where nothing follows. Followed by itself, {text}.")
 
 
 def _describe_kept(followed: np.ndarray) -> str:

@@ -9,7 +9,7 @@ from services.reporting.page import DataTable, Part, Prose, Section
 from services.reporting.run_group import RunGroup, has_sub_skills
 from services.reporting.sub_skill_pictures import draw_timelines, draw_transitions, draw_usage
 
-DRAWN = 3
+MOST_TIMELINES = 3
 """So many demonstrations are drawn; the statistics are of all."""
 
 
@@ -32,17 +32,17 @@ def sub_skill_sections(group: RunGroup, shots: int = 1, rollouts: int = 3) -> li
 
 def _parts(task: str, shots: int, choices: Sequence[Choices]) -> list[Part]:
     kinds = [on for on in (DEMONSTRATIONS, ROLLOUTS) if any(choice.timelines[on] for choice in choices)]
-    drawn = min(DRAWN, len(choices[0].timelines[DEMONSTRATIONS]))
+    count = min(MOST_TIMELINES, len(choices[0].timelines[DEMONSTRATIONS]))
     support = "one held-out demonstration" if shots == 1 else f"{shots} held-out demonstrations"
     return [
         Prose(
             f"Which sub-skill the high level takes at each step of {task}: before adaptation, which is after no step "
             f"of fine-tuning, and after the fine-tuning of the run's evaluation, to {support}. Drawn are "
-            f"{drawn} of the {len(choices[0].timelines[DEMONSTRATIONS])} held-out demonstrations that were not adapted "
+            f"{count} of the {len(choices[0].timelines[DEMONSTRATIONS])} held-out demonstrations that were not adapted "
             "to, with their numbers in the data set, and the first episodes of the evaluation with this support set. "
             "An episode ends when the task is solved. Statistics are of all that was not adapted to."
         ),
-        *(draw_timelines(f"{task}: sub-skills in {on}", choices, on, DRAWN) for on in kinds),
+        *(draw_timelines(f"{task}: sub-skills in {on}", choices, on, MOST_TIMELINES) for on in kinds),
         draw_usage(f"{task}: how sub-skills are used", choices, kinds),
         _usage_table(task, choices, kinds),
         draw_transitions(f"{task}: which sub-skill follows which in {DEMONSTRATIONS}", choices, DEMONSTRATIONS),

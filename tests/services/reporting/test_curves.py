@@ -7,7 +7,7 @@ from dmil_core.methods.dmil.config import DmilConfig
 from services.demonstrations.store import DemoStore
 from services.evaluation.results import EpisodeResult
 from services.experiments.experiment import Experiment
-from services.reporting.curves import DRAWN, HATCHES, OTHERS, draw_metrics, draw_success
+from services.reporting.curves import HATCHES, MOST_POINTS, OTHERS, draw_metrics, draw_success
 from services.reporting.drawing import colour_of
 from tests.services.distributed.courses import alone
 from tests.services.experiments.test_methods import LEARNERS, smoke
@@ -24,7 +24,7 @@ def course(count: int, sub_skills: int, **others: float) -> list[dict[str, float
     return [{"iteration": n + 1, **dict.fromkeys(DMIL, 0.5), **shares, **others} for n in range(count)]
 
 
-@pytest.mark.parametrize("count", [1, 2, DRAWN + 1, 7 * DRAWN])
+@pytest.mark.parametrize("count", [1, 2, MOST_POINTS + 1, 7 * MOST_POINTS])
 def test_curves_are_drawn_from_however_many_iterations(count: int):
     losses, use, step = draw_metrics(course(count, 3))
     assert [losses.title, use.title, step.title] == ["Losses", "Use of sub-skills", "Outer step"]
@@ -45,7 +45,7 @@ def test_a_sub_skill_has_its_colour_and_hatch_however_many_there_are():
 
 
 def test_a_point_is_the_mean_of_its_iterations():
-    rows = [{"iteration": n + 1, "gradient_norm": float(n % 2)} for n in range(4 * DRAWN)]
+    rows = [{"iteration": n + 1, "gradient_norm": float(n % 2)} for n in range(4 * MOST_POINTS)]
     (picture,) = draw_metrics(rows)
     assert picture.description == "Gradient: gradient norm from 0.5 to 0.5."
 

@@ -13,7 +13,7 @@ from services.reporting.film import (
     BORDER,
     FAILED,
     FORMS,
-    HELD_SECONDS,
+    LAST_PICTURE_SECONDS,
     SOLVED,
     Side,
     compose,
@@ -69,7 +69,7 @@ def test_the_strip_below_holds_all_sub_skills_so_far():
 @pytest.mark.parametrize(("success", "band"), [(True, SOLVED), (False, FAILED)])
 def test_the_last_picture_says_whether_it_was_solved_and_stays(success: bool, band: str):
     pictures = list(compose([made_up(success)], rate=10))
-    held = int(HELD_SECONDS * 10)
+    held = int(LAST_PICTURE_SECONDS * 10)
     assert len(pictures) == len(SUB_SKILLS) + held
     marked = [(picture == rgb(band)).all(axis=2).any() for picture in pictures]
     assert marked == [False] * len(SUB_SKILLS) + [True] * held

@@ -6,7 +6,7 @@ import matplotlib
 import numpy as np
 import pytest
 
-from services.reporting.drawing import COLOURS, colour_of, drawn, panels, style_of
+from services.reporting.drawing import COLOURS, colour_of, panels, style_of, to_picture
 from services.reporting.page import Clip, Commands, DataTable, Prose, Section, write_page
 
 
@@ -17,7 +17,7 @@ def lines(title: str):
             axis.fill_between([0, 1], [0, 1], [1, 2], hatch="//", alpha=0.3, color=colour_of(index))
             axis.legend()
             axis.set(title=title, xlabel="iteration")
-        return drawn(figure, title, "Two lines <rising> & crossing.")
+        return to_picture(figure, title, "Two lines <rising> & crossing.")
 
 
 @pytest.fixture
