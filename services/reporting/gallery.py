@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
 from dmil_core.errors import UserError
 from services.cli.arguments import parse
+from services.cli.places import announce
 from services.cli.progress import Bar, console
 from services.rollouts.episodes import demonstrate
 from services.storage.files import room_for
@@ -46,6 +47,7 @@ class Arguments:
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     args = parse(Arguments, __doc__ or "", arguments, Arguments())
+    announce(gallery=(args.output, "--output FOLDER"))
     for name in args.suites:
         suite = open_suite(SuiteConfig(name=name))
         camera: str | View | None = getattr(suite, "camera", None)

@@ -11,6 +11,7 @@ import tyro
 
 from dmil_core.errors import UserError
 from services.cli.arguments import parse
+from services.cli.places import announce
 from services.cli.progress import Bar, console
 from services.distributed.ray_runner import RunnerKind, open_runner
 from services.experiments.finished_run import FinishedRun
@@ -111,6 +112,7 @@ def run(arguments: Sequence[str]) -> None:
     path = args.output or finished.folder / "report" / PAGE
     if path.is_dir():
         raise UserError(f"--output: got {path}, a folder; wanted a file, as {path / PAGE}")
+    announce(report=(path, "--output FILE"))
     path.parent.mkdir(parents=True, exist_ok=True)
     if args.adaptation:
         with open_runner(args.runner, finished.experiment.suite, args.workers) as runner:

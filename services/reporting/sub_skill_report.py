@@ -14,7 +14,7 @@ import tyro
 
 from dmil_core.errors import UserError
 from services.cli.arguments import parse
-from services.cli.progress import console
+from services.cli.places import announce
 from services.experiments.finished_run import FinishedRun
 from services.reporting.embedding import PERPLEXITY, SEED, embedding_section
 from services.reporting.embedding import SHOTS as EMBEDDING_SHOTS
@@ -56,6 +56,7 @@ def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
     _check(args)
+    announce(page=(args.output, "--output FILE"))
     torch.set_num_threads(1)
     group = group_runs(_labelled_runs(args.which, args.runs), args.tasks)
     sections = sub_skill_sections(group, args.shots, args.rollouts)
@@ -65,7 +66,6 @@ def run(arguments: Sequence[str]) -> None:
         _runs_table(group),
     ]
     write_page(args.output, f"Sub-skills on {', '.join(group.held_out)}", lead, sections)
-    console.print(str(args.output), markup=False)
 
 
 def _check(args: Arguments) -> None:

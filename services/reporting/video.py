@@ -13,6 +13,7 @@ import tyro
 from dmil_core.errors import UserError, shorten
 from dmil_core.settings import sub_skills_of
 from services.cli.arguments import parse
+from services.cli.places import announce
 from services.cli.progress import console
 from services.evaluation.results import EpisodeResult
 from services.experiments.finished_run import FinishedRun
@@ -51,6 +52,7 @@ def run(arguments: Sequence[str]) -> None:
     path = args.output or finished.folder / "report" / "videos" / f"{name_of(row)}.{args.format}"
     if path.suffix != f".{args.format}":
         raise UserError(f"--output: got {path}; wanted a name that ends in .{args.format}, or another --format")
+    announce(film=(path, "--output FILE"))
     with replaying(finished) as replay:
         sides, replayed = _sides(replay, row, FORMS[args.format], demonstration=args.demonstration)
     if replayed.difference is not None:

@@ -9,7 +9,7 @@ import tyro
 
 from dmil_core.errors import UserError
 from services.cli.arguments import parse
-from services.cli.progress import console
+from services.cli.places import announce
 from services.evaluation.comparison import Comparison
 from services.experiments.finished_run import FinishedRun
 from services.reporting.comparison import compare_runs
@@ -40,30 +40,33 @@ def run(arguments: Sequence[str]) -> None:
     sweeps = [name for name in args.names if any((place / MARK).is_file() for place in (Path(name), args.runs / name))]
     if sweeps and len(args.names) > 1:
         raise UserError(f"RUN: got the sweep {sweeps[0]} with others; wanted it alone, or finished runs only")
-    path = _of_sweep(sweeps[0], args) if sweeps else _of_runs(args)
-    console.print(f"page: {path}", markup=False)
+    if sweeps:
+        _of_sweep(sweeps[0], args)
+    else:
+        _of_runs(args)
 
 
-def _of_sweep(name: str, args: Arguments) -> Path:
+def _of_sweep(name: str, args: Arguments) -> None:
     sweep = SweepFolder(find_folder(name, args.runs, MARK, "SWEEP"))
     rows = sweep.record.sweep.row_names
     if args.baseline is not None and args.baseline not in rows:
         raise UserError(f"--baseline: got {args.baseline!r}; wanted one of {', '.join(rows)}")
     comparison = comparison_of(sweep, args.baseline)
     path = args.output or sweep.path / "tables" / "report.html"
+    announce(page=(path, "--output FILE"))
     path.parent.mkdir(parents=True, exist_ok=True)
     write_sweep_page(tables_of(sweep, comparison), comparison, path)
-    return path
 
 
-def _of_runs(args: Arguments) -> Path:
+def _of_runs(args: Arguments) -> None:
     if len(args.names) < 2:
         raise UserError(f"RUN: got {' '.join(args.names) or 'none'}; wanted two finished runs or more, or one sweep")
     runs = [FinishedRun.find(name, args.runs) for name in args.names]
     comparison = compare_runs(runs, args.baseline)
     path = args.output or Path("comparison.html")
+    announce(page=(path, "--output FILE"))
     path.parent.mkdir(parents=True, exist_ok=True)
-    again = ["python", "-m", "services.report", "compare", *args.names, "--runs", str(args.runs)]
+    again = ["dmil", "report", "compare", *args.names, "--runs", str(args.runs)]
     again += [] if args.baseline is None else ["--baseline", args.baseline]
     lead = [
         f"{len(runs)} runs on {comparison.suites[0]}; the others are compared with {comparison.baseline}. Runs that "
@@ -71,7 +74,6 @@ def _of_runs(args: Arguments) -> Path:
     ]
     title = f"{', '.join(comparison.rows)} side by side"
     write_comparison(path, title, lead, comparison, [Commands("To make this page again", [shlex.join(again)])])
-    return path
 
 
 def write_sweep_page(tables: Tables, comparison: Comparison, path: Path) -> None:

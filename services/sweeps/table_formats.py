@@ -13,6 +13,7 @@ from rich.table import Table
 from dmil_core.statistics import interval_text
 from services.cli.arguments import parse
 from services.cli.escapes import for_csv, for_latex, for_markdown, one_line
+from services.cli.places import announce
 from services.cli.progress import console
 from services.evaluation.comparison import DIGITS, Cell, Difference, Unpaired
 from services.evaluation.summary import markdown_rows
@@ -234,4 +235,5 @@ def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
     sweep = SweepFolder(find_folder(args.sweep, args.runs, MARK, "SWEEP"))
+    announce(tables=(sweep.path / "tables", "--runs FOLDER"))
     show(write_tables(sweep), sweep)

@@ -220,7 +220,7 @@ def test_report_tables_finds_a_sweep_by_name(tmp_path: Path, capsys: pytest.Capt
         assert words in printed
     assert "got 'none-such'" in complaint(report.run, "tables", "none-such", "--runs", str(tmp_path))
     (tmp_path / "made-up" / "sweep.json").write_text("{}")
-    assert "sweep.json: name" in complaint(report.run, "tables", "made-up", "--runs", str(tmp_path))
+    assert "sweep.json: got name" in complaint(report.run, "tables", "made-up", "--runs", str(tmp_path))
 
 
 def test_outcomes_keep_their_order(tmp_path: Path) -> None:
