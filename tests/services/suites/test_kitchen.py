@@ -5,6 +5,7 @@ from typing import Any
 import mujoco as compiled_mujoco
 import numpy as np
 import pytest
+from gymnasium_robotics.envs.franka_kitchen import kitchen_env
 
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError
@@ -53,6 +54,11 @@ def test_the_state_is_the_positions_of_robot_and_objects(env):
     assert np.allclose(data.qpos[[*range(7), 23, 24]], env._rest[[*range(7), 23, 24]] + info["goal"])
     assert np.abs(info["goal"][:7]).max() <= 0.05
     assert np.abs(info["goal"][7:]).max() <= 0.01
+
+
+def test_the_model_is_shared_and_gymnasium_robotics_stays_as_it_is(env):
+    assert env.model is kitchen_model()
+    assert kitchen_env.FrankaRobot.__module__.startswith("gymnasium_robotics.")
 
 
 def test_a_sub_task_counts_once_and_stays_counted(env):
