@@ -20,7 +20,7 @@ from services.cli.progress import console
 from services.demonstrations.store import data_root
 from services.distributed.cluster import joined, named_address
 from services.distributed.node_info import NodeFacts, cluster_facts, facts
-from services.storage.files import DiskFullError, write_file
+from services.storage.files import DiskFullError, read_file, remove_file, write_file
 from services.storage.redaction import error_line, redacted
 from services.tracking.client import connect
 from services.tracking.links import tracking_uri
@@ -77,12 +77,11 @@ def run(arguments: Sequence[str]) -> None:
 
 @contextmanager
 def _marked(mark: Path) -> Iterator[None]:
-    mark.parent.mkdir(parents=True, exist_ok=True)
-    mark.touch()
+    write_file(mark.parent, mark.name, b"")
     try:
         yield
     finally:
-        mark.unlink()
+        remove_file(mark.parent, mark.name)
 
 
 def examine(nodes: Sequence[NodeFacts]) -> Iterator[Finding]:
@@ -154,12 +153,11 @@ def _clock(node: NodeFacts) -> Finding:
 
 def _storage(what: str, folder: Path, mark: str) -> Iterator[Finding]:
     """Write a file in place of another, as checkpoints and records are."""
-    path, there = folder / f"{mark}-file", folder.exists()
+    name, there = f"{mark}-file", folder.exists()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_file(path, "before")
-        write_file(path, "after")
-        if (content := path.read_text()) != "after":
+        write_file(folder, name, b"before")
+        write_file(folder, name, b"after")
+        if (content := read_file(folder, name, 100)) != b"after":
             yield Finding(f"storage of {what}", "bad", f"{folder}: a file that was replaced still holds {content!r}",
                           "use a file system with atomic renames")  # fmt: skip
             return
@@ -168,8 +166,7 @@ def _storage(what: str, folder: Path, mark: str) -> Iterator[Finding]:
         remedy = "make it writable for you, or name another: --runs, DMIL_DATA"
         yield Finding(f"storage of {what}", "bad", f"{folder}: {error}", remedy)
     finally:
-        if path.exists():
-            path.unlink()
+        remove_file(folder, name)
         if folder.exists() and not there:
             folder.rmdir()
 

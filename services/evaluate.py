@@ -23,6 +23,7 @@ from services.experiments.champions import ALIAS, open_promotion
 from services.experiments.experiment import Experiment
 from services.reporting.end_of_run import show, write_report
 from services.storage.checkpoints import Checkpoint, Checkpoints
+from services.storage.folder_lock import held
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,11 @@ def run(arguments: Sequence[str]) -> None:
         config = config.model_copy(update={"suite": config.suite.model_copy(update={"test_tasks": args.tasks})})
     experiment = Experiment(config, store := open_store())
     announce(evaluation=(args.output, "--output FOLDER"), demonstrations=(store.root, f"{DATA}=FOLDER"))
-    args.output.mkdir(parents=True, exist_ok=True)
+    with held(args.output):
+        _carry_out(args, checkpoint, experiment)
+
+
+def _carry_out(args: Arguments, checkpoint: Checkpoint, experiment: Experiment) -> None:
     promotion = open_promotion(checkpoint, experiment, args.output / ALIAS) if args.promote else None
     clock = Clock()
     with open_runner(args.runner, experiment.suite, args.workers) as runner:

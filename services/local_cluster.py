@@ -114,7 +114,7 @@ class Record(BaseModel):
         if not path.exists():
             return None
         try:
-            return Record.model_validate_json(read_file(path, MOST_BYTES))
+            return Record.model_validate_json(read_file(folder, path.name, MOST_BYTES))
         except (OSError, ValidationError) as error:
             got = describe_errors(error) if isinstance(error, ValidationError) else str(error)
             raise UserError(
@@ -167,7 +167,7 @@ def _start(settings: Arguments) -> None:
                 )  # fmt: skip
             started.append(Started.of(server.name, process.pid))
             record = Record(processes=started, temporary=temporary, dashboard=dashboard, mlflow=mlflow)
-            write_file(folder / "cluster.json", record.model_dump_json(indent=1) + "\n")
+            write_file(folder, "cluster.json", record.model_dump_json(indent=1) + "\n")
             console.print(f"starting {server.name} ...")
             _wait(server, process, folder / f"{server.name}.log", token.read_text())
     except BaseException:
@@ -358,7 +358,7 @@ def _made_for(temporary: Path, folder: Path) -> bool:
     try:
         found = temporary.lstat()
         private = stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077
-        return private and read_file(temporary / MARK, MOST_BYTES) == os.fsencode(folder)
+        return private and read_file(temporary, MARK, MOST_BYTES) == os.fsencode(folder)
     except OSError:
         return False
 

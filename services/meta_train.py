@@ -25,13 +25,14 @@ from services.distributed.ray_runner import RunnerKind, open_runner
 from services.evaluation.summary import summarise
 from services.experiments.experiment import Experiment, OnNonfinite
 from services.experiments.finished_run import FinishedRun
-from services.reporting.end_of_run import PAGE, publish, show, write_report
-from services.storage.checkpoints import Checkpoint, Checkpoints
-from services.storage.files import read_file, write_file
+from services.reporting.end_of_run import PAGE, REPORT, publish, show, write_report
+from services.storage.checkpoints import Checkpoints
+from services.storage.files import inside, read_file, write_file
+from services.storage.folder_lock import held
 from services.storage.redaction import redacted
 from services.storage.remote import STORAGE
-from services.storage.replication import replicated, restored
-from services.storage.run_folders import find_folder, new_folder
+from services.storage.replication import claim_name, replicated, restored
+from services.storage.run_folders import find_folder, make_folder, new_name
 from services.tracking.links import database, tracking_uri
 from services.tracking.system import recording_system
 from services.tracking.tracker import Tracker, record_settings
@@ -81,23 +82,26 @@ class Arguments:
 
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
-    args, folder, checkpoint = _read(arguments)
-    with replicated(folder):
-        _carry_out(args, folder, checkpoint)
-
-
-def _carry_out(args: Arguments, folder: Path, checkpoint: Checkpoint | None) -> None:
-    config = args.experiment
-    experiment = Experiment(config, store := open_store())
+    args, folder = _read(arguments)
+    experiment = Experiment(args.experiment, store := open_store())
     announce(
         run=(folder, "--runs FOLDER"),
         demonstrations=(store.root, f"{DATA}=FOLDER"),
         MLflow=(database(tracking_uri()), "MLFLOW_TRACKING_URI=sqlite:///FILE"),
     )
+    if args.resume is None:
+        make_folder(folder)
+        claim_name(folder)
+    with held(folder), replicated(folder):
+        _carry_out(args, folder, experiment)
+
+
+def _carry_out(args: Arguments, folder: Path, experiment: Experiment) -> None:
+    config = args.experiment
     checkpoints = Checkpoints(folder / "checkpoints", config.training.checkpoints_kept)
+    checkpoint = checkpoints.newest() if checkpoints.all() else None
     clock = Clock()
-    folder.mkdir(parents=True, exist_ok=True)
-    write_file(folder / MARK, config.model_dump_json(indent=1) + "\n")
+    write_file(folder, MARK, config.model_dump_json(indent=1) + "\n")
     tracker = Tracker(folder, f"dmil-{config.suite.name}")
     status = "FAILED"
     try:
@@ -123,7 +127,7 @@ def _carry_out(args: Arguments, folder: Path, checkpoint: Checkpoint | None) -> 
         write_report(summary, folder)
         from services.reporting.run_report import write_run_page  # takes seconds to import: not for --help
 
-        write_run_page(FinishedRun(folder), folder / "report" / PAGE)
+        write_run_page(FinishedRun(folder), inside(folder, REPORT) / PAGE)
         publish(tracker, summary, folder)
         tracker.model(trained.path, experiment.held_out_sets(data)[experiment.tasks[-1][1]][:1])
         status = "FINISHED"
@@ -136,16 +140,15 @@ def _carry_out(args: Arguments, folder: Path, checkpoint: Checkpoint | None) -> 
     show(summary, tracker.address_lines)
 
 
-def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]:
-    """Return the arguments, the run's folder, and the checkpoint to go on from."""
+def _read(arguments: Sequence[str]) -> tuple[Arguments, Path]:
+    """Return the arguments and the run's folder, which a new one does not have yet."""
     early = peek(arguments, **EARLY, resume=str, runs=Path)
     if early.resume is None:
         args = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(early)))
         config = args.experiment
         named = "" if config.method.name == DEFAULT_METHOD else f"{config.method.name}-"
         kind = f"{config.suite.name}-{named}{args.preset.rpartition('-')[2]}"
-        folder = new_folder(args.name or f"{kind}-{datetime.now():%Y%m%d-%H%M%S}", args.runs, MARK)
-        return args, folder, None
+        return args, new_name(args.name or f"{kind}-{datetime.now():%Y%m%d-%H%M%S}", args.runs)
     if any(getattr(early, name) for name in EARLY):
         raise UserError(
             "--resume: got --preset, --config, --suite, --method or --demos with it; wanted none: a run goes on with "
@@ -157,14 +160,13 @@ def _read(arguments: Sequence[str]) -> tuple[Arguments, Path, Checkpoint | None]
         console.print(f"fetched from {redacted(os.environ[STORAGE])}: {wanted}", markup=False)
     folder = find_folder(early.resume, runs, MARK)
     try:
-        before = ExperimentConfig.model_validate_json(read_file(folder / MARK, MOST_BYTES))
+        before = ExperimentConfig.model_validate_json(read_file(folder, MARK, MOST_BYTES))
     except (OSError, ValidationError) as error:
         got = describe_errors(error) if isinstance(error, ValidationError) else error
         raise UserError(f"{folder / 'config.json'}: {got}; start a new run") from error
     args = parse(Arguments, __doc__ or "", arguments, Arguments(before))
     _same_run(before, args.experiment)
-    saved = Checkpoints(folder / "checkpoints", args.experiment.training.checkpoints_kept)
-    return args, folder, saved.newest() if saved.all() else None
+    return args, folder
 
 
 def _same_run(before: ExperimentConfig, now: ExperimentConfig) -> None:

@@ -24,8 +24,9 @@ from services.demonstrations.store import DATA, data_root, open_store
 from services.distributed.cluster import joined
 from services.distributed.ray_runner import open_runner
 from services.experiments.experiment import Experiment
+from services.storage.folder_lock import held
 from services.storage.provenance import git_commit, library_versions
-from services.storage.run_folders import find_folder, new_folder
+from services.storage.run_folders import find_folder, new_name
 from services.suites.registry import open_suite
 from services.sweeps.folders import MARK, SweepFolder, SweepRecord
 from services.sweeps.settings import Preset, Sweep, planned
@@ -75,6 +76,11 @@ def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     args = parse(Arguments, _description(), arguments, Arguments())
     sweep = _resumed(args) if args.resume is not None else _begun(args)
+    with held(sweep.path):
+        _carry_out(sweep)
+
+
+def _carry_out(sweep: SweepFolder) -> None:
     clock = Clock()
     tracker = Tracker(sweep.path, f"dmil-{sweep.record.name}")
     status = "FAILED"
@@ -143,7 +149,7 @@ def _begun(args: Arguments) -> SweepFolder:
     for trial in planned(sweep, args.preset):
         open_suite(trial.config.suite)
     name = args.name or f"{file.stem}-{args.preset}-{datetime.now():%Y%m%d-%H%M%S}"
-    folder = new_folder(name, args.runs, MARK)
+    folder = new_name(name, args.runs)
     _announce(folder)
     record = SweepRecord(
         name=file.stem,

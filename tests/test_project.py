@@ -144,3 +144,49 @@ def test_files_that_a_page_names_exist(page: Path):
     made = ("deploy/secrets/",)  # by a script, for one machine alone
     places = [name for name in named if "NAME" not in name and not name.startswith(made)]
     assert [name for name in places if not (PROJECT / name).exists()] == []
+
+
+OPENING = {
+    "open", "read_text", "read_bytes", "write_text", "write_bytes", "unlink", "rename", "rmdir", "touch", "mkdir",
+    "makedirs", "symlink_to", "hardlink_to", "mkstemp", "mkdtemp", "NamedTemporaryFile",
+}  # fmt: skip
+"""Calls by which files are opened, made or removed; and all of shutil's, but these:"""
+HARMLESS = {"shutil.disk_usage", "shutil.which", "shutil.get_terminal_size"}
+FREE = {"services/storage/files.py", "services/local_cluster.py"}
+"""The one way into a folder, and what has folders of its own."""
+BY_HAND = {
+    "services/demonstrations/npz.py": {"archive.open"},  # a member of an archive in memory
+    "services/evaluation/paper_results.py": {"(files('services.evaluation') / 'paper_results.json').read_text"},
+    "services/doctor.py": {"folder.rmdir"},  # one that it made, if it is empty
+    "services/experiments/champions.py": {"folder.mkdir"},  # for MLflow to download into
+    "services/reporting/film.py": {"made.read_bytes"},  # out of a temporary folder of its own
+    "services/storage/private.py": {"shutil.rmtree", "tempfile.mkdtemp"},
+    "services/storage/remote.py": {"self._files.makedirs", "self._files.open"},
+    "services/storage/run_folders.py": {"folder.mkdir"},  # takes a name
+}
+"""Who else does it, and what."""
+
+
+def opened_by_hand(source: str) -> set[str]:
+    """Return the calls that open, make or remove a file."""
+    tree = ast.parse(source)
+    names, found = full_names(tree), set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            first, dot, rest = called.partition(".")
+            full = names.get(first, first) + dot + rest
+            if full.rpartition(".")[2] in OPENING or (full.startswith("shutil.") and full not in HARMLESS):
+                found.add(called)
+    return found
+
+
+def test_what_opens_a_file_by_hand_is_found():
+    source = "import shutil as s\nfrom os import unlink as u\ns.rmtree(a)\nu(b)\nPath(c).open()\nopen(d)\ns.which(e)"
+    assert opened_by_hand(source) == {"s.rmtree", "u", "Path(c).open", "open"}
+
+
+def test_files_of_folders_are_opened_in_one_way():
+    services = {str(path.relative_to(PROJECT)): path for path in FILES if path.is_relative_to(PROJECT / "services")}
+    found = {name: opened_by_hand(path.read_text("utf-8")) for name, path in services.items() if name not in FREE}
+    assert {name: calls for name, calls in found.items() if calls} == BY_HAND, "see services/storage/files.py"

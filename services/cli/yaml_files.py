@@ -7,7 +7,7 @@ from typing import Any
 import yaml
 
 from dmil_core.errors import UserError, shorten
-from services.storage.files import read_file
+from services.storage.files import named, read_file
 
 MOST_BYTES = 2**16
 """In a file of settings; PyYAML may need a second for so many."""
@@ -42,7 +42,7 @@ def read_yaml(file: Path, flag: str) -> dict[Any, Any]:
         UserError: names `flag` and the file that is none, or is too large, nested or damaged to be read.
     """
     try:
-        loader = _PlainLoader(read_file(file, MOST_BYTES).decode())
+        loader = _PlainLoader(read_file(*named(file), MOST_BYTES).decode())
         try:
             values = loader.get_single_data()
         finally:

@@ -14,7 +14,7 @@ from dmil_core.demonstrations import Demonstration, DemonstrationError, digest
 from services.demonstrations.hdf5 import PlainFile, open_plain
 from services.demonstrations.npz import read_npz
 from services.demonstrations.store import TaskDemonstrations, data_root
-from services.storage.files import inside, read_file
+from services.storage.files import inside, named, read_file
 from services.suites.base import TaskSuite
 
 FORMS = ("minari", "hdf5", "npz")
@@ -134,10 +134,10 @@ def _read_minari(dataset_id: str) -> list[ExternalEpisode]:
         raise DemonstrationError(
             f"got nothing at {folder}, nor in {data_root()}; wanted a data set; minari download {dataset_id}"
         )
-    metadata = _Metadata.model_validate_json(read_file(folder / "metadata.json", MAX_METADATA))
+    metadata = _Metadata.model_validate_json(read_file(folder, "metadata.json", MAX_METADATA))
     if metadata.data_format != "hdf5":
         raise DemonstrationError(f"data_format: got {metadata.data_format}; wanted hdf5; store the data set as that")
-    with open_plain(folder / "main_data.hdf5") as file:
+    with open_plain(folder, "main_data.hdf5") as file:
         return [_episode(file, f"episode_{index}") for index in range(metadata.total_episodes)]
 
 
@@ -165,7 +165,7 @@ def _observations(file: PlainFile, name: str) -> Float32[np.ndarray, "steps obs_
 
 
 def _read_hdf5(path: Path) -> list[ExternalEpisode]:
-    with open_plain(path) as file:
+    with open_plain(*named(path)) as file:
         observations, actions = (file.array(name, axes=2) for name in ("observations", "actions"))
         if len(observations) != len(actions):
             raise DemonstrationError(

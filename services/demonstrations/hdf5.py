@@ -1,8 +1,6 @@
 """HDF5 files of somebody else's, read as data alone: nothing outside the file, and no more than it can hold."""
 
-import errno
 import os
-import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +9,7 @@ import h5py
 import numpy as np
 
 from dmil_core.demonstrations import DemonstrationError
+from services.storage.files import open_file
 
 MAX_ARRAYS = 2**32
 """Bytes of all arrays that are read from one file together."""
@@ -79,16 +78,11 @@ class PlainFile:
 
 
 @contextmanager
-def open_plain(path: Path) -> Iterator[PlainFile]:
-    """Open an HDF5 file for reading.
+def open_plain(root: Path, name: str) -> Iterator[PlainFile]:
+    """Open an HDF5 file below a folder for reading.
 
     Raises:
         OSError: if it is no regular file, such as a pipe, or no HDF5 file.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe without a writer would wait for ever
-    with os.fdopen(descriptor, "rb") as content:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            raise OSError(errno.EINVAL, "is no regular file", str(path))
-        with h5py.File(content, "r") as file:
-            yield PlainFile(file, status.st_size)
+    with open_file(root, name) as content, h5py.File(content, "r") as file:
+        yield PlainFile(file, os.fstat(content.fileno()).st_size)

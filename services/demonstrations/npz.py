@@ -15,7 +15,7 @@ import numpy as np
 
 from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.errors import shorten
-from services.storage.files import read_file
+from services.storage.files import named, read_file
 
 FORMS = {"observations": ("f", 2), "actions": ("f", 2), "episode_lengths": ("iu", 1), "tasks": ("U", 1)}
 """Of each array, the kinds of numbers and the number of axes."""
@@ -51,7 +51,7 @@ def read_npz(path: Path, task: str, obs_dim: int | None = None) -> list[Demonstr
             unpack to more than is sane are refused before they are unpacked.
     """
     try:
-        arrays = _read_arrays(read_file(path, MOST_ARCHIVE))
+        arrays = _read_arrays(read_file(*named(path), MOST_ARCHIVE))
         observations, actions, lengths = (arrays[name] for name in ("observations", "actions", "episode_lengths"))
         _check_lengths(lengths, len(observations), len(actions))
         if obs_dim is not None and not 0 < obs_dim <= observations.shape[1]:

@@ -3,13 +3,10 @@
 ``MINARI_DATASETS_PATH=data minari list local`` shows what is there.
 """
 
-import errno
 import hashlib
 import json
 import logging
 import os
-import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -28,8 +25,8 @@ from dmil_core.configs import DemonstrationConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError, digest
 from dmil_core.errors import describe_errors
 from dmil_core.trajectories import Episode
-from services.storage.checksums import check_listing, write_listing
-from services.storage.files import inside, read_file, room_for, sync
+from services.storage.checksums import MOST_LISTED, check_listing, write_listing
+from services.storage.files import ForeignFileError, inside, making_folder, open_file, read_file, room_for
 from services.storage.redaction import error_line
 from services.storage.remote import Storage, given_storage
 from services.suites.base import TaskSuite
@@ -102,11 +99,13 @@ class DemoStore:
             if not inside(self.root, dataset_id).exists() and not self._fetched(dataset_id):
                 return None
             check_listing(path, DIGESTS, FILES)
-            metadata = _Metadata.model_validate_json(read_file(path / METADATA, MOST_METADATA))
+            metadata = _Metadata.model_validate_json(read_file(path, METADATA, MOST_METADATA))
             demonstrations = tuple(
                 Demonstration(f"{index:03d}", task, observations[:-1], actions)
-                for index, (observations, actions) in enumerate(_read_episodes(path / ARRAYS, metadata.total_episodes))
+                for index, (observations, actions) in enumerate(_read_episodes(path, metadata.total_episodes))
             )
+        except ForeignFileError as error:
+            raise self._damaged(error.filename, str(error.strerror)) from error
         except ValidationError as error:
             raise self._damaged(path / METADATA, describe_errors(error, "metadata", "; ")) from error
         except DemonstrationError as error:
@@ -127,13 +126,13 @@ class DemoStore:
         path = self.root / dataset_id
         try:
             check_listing(inside(self.root, dataset_id), DIGESTS, FILES)
-            with h5py.File(path / ARRAYS) as file:
+            with open_file(path, ARRAYS) as content, h5py.File(content, "r") as file:
                 return int(np.asarray(file[f"episode_{number}"].attrs["seed"]).item())
         except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
             raise self._damaged(path, f"{type(error).__name__}: {error}") from error
 
     @staticmethod
-    def _damaged(path: Path, got: str) -> DemonstrationError:
+    def _damaged(path: Path | str, got: str) -> DemonstrationError:
         return DemonstrationError(
             f"{path}: got {got}; wanted a whole data set as collect_demos writes it; remove it and collect again"
         )
@@ -171,20 +170,13 @@ class DemoStore:
             "versions": json.dumps({library: version(library) for library in LIBRARIES}),
         }
         with room_for(path, _bytes_on_disk(successes)):
-            self.root.mkdir(parents=True, exist_ok=True)
-            writing = Path(tempfile.mkdtemp(prefix=".writing-", dir=self.root))
-            writing.chmod(0o755)
             try:
-                _write(writing, successes, metadata)
-                path.parent.mkdir(parents=True, exist_ok=True)
-                writing.replace(path)
-                sync(path.parent)
-            except OSError as error:
-                if error.errno not in {errno.ENOTEMPTY, errno.EEXIST} or not (there := self.load(dataset_id, task)):
+                with making_folder(self.root, dataset_id) as made:
+                    _write(made, successes, metadata)
+            except FileExistsError:
+                if not (there := self.load(dataset_id, task)):
                     raise
                 return there
-            finally:
-                shutil.rmtree(writing, ignore_errors=True)
         self._copy(dataset_id)
         return TaskDemonstrations(dataset_id, demonstrations, failed, metadata["digest"])
 
@@ -193,7 +185,7 @@ class DemoStore:
         if self._storage is None:
             return False
         try:
-            return self._storage.get_folder(f"data/{dataset_id}", self.root / dataset_id, FILES, DIGESTS)
+            return self._storage.get_folder(f"data/{dataset_id}", self.root, dataset_id, FILES, DIGESTS)
         except Exception as error:  # noqa: BLE001  whatever a storage raises, demonstrations can be made again
             logger.warning(f"{self._storage.url} gives no {dataset_id}: {error_line(error)}")
             return False
@@ -202,7 +194,8 @@ class DemoStore:
         """Copy a new data set to the storage."""
         if self._storage is None:
             return
-        contents = {file: (self.root / dataset_id / file).read_bytes() for file in (*FILES, DIGESTS)}
+        sizes = {**FILES, DIGESTS: MOST_LISTED}
+        contents = {file: read_file(self.root, f"{dataset_id}/{file}", most) for file, most in sizes.items()}
         try:
             self._storage.put_folder(f"data/{dataset_id}", contents, DIGESTS)
         except Exception as error:  # noqa: BLE001  whatever a storage raises, they are here
@@ -228,8 +221,6 @@ def _write(folder: Path, successes: Sequence[Episode], metadata: dict[str, Any])
     storage.update_metadata(metadata)
     storage.update_episodes([_episode(attempt) for attempt in successes])
     write_listing(folder, DIGESTS, (ARRAYS, METADATA))
-    for name in (ARRAYS, METADATA, "data", "."):
-        sync(folder / name)
 
 
 def _bytes_on_disk(successes: Sequence[Episode]) -> int:
@@ -239,17 +230,17 @@ def _bytes_on_disk(successes: Sequence[Episode]) -> int:
     return states + 10 * steps + 2**13 * len(successes) + 2**16
 
 
-def _read_episodes(path: Path, number: int) -> list[tuple[np.ndarray, np.ndarray]]:
+def _read_episodes(folder: Path, number: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the observations and the actions of each episode, one observation more than actions.
 
     Raises:
         ValueError: names what is not as it was written, before any array is read.
     """
-    with h5py.File(path) as file:
+    with open_file(folder, ARRAYS) as content, h5py.File(content, "r") as file:
         found = [_find_episode(file, f"episode_{index}", index) for index in range(number)]
         size = sum(array.nbytes for arrays in found for array in arrays)
-        if size > path.stat().st_size:  # as where they are compressed, or one array has several names
-            raise ValueError(f"got arrays of {size} bytes in a file of {path.stat().st_size}; wanted them all in it")
+        if size > (held := os.fstat(content.fileno()).st_size):  # as where they are compressed, or have two names
+            raise ValueError(f"got arrays of {size} bytes in a file of {held}; wanted them all in it")
         return [(observations[()], actions[()]) for observations, actions in found]
 
 

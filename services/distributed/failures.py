@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import RunError, UserError, WorkError
-from services.storage.files import read_file, write_file
+from services.storage.files import named, read_file, write_file
 from services.storage.provenance import library_versions
 
 MOST_BYTES = 10_000_000
@@ -46,7 +46,6 @@ def keeping_failures(
         yield
     except WorkError as error:
         path = folder / "failure.json"
-        folder.mkdir(parents=True, exist_ok=True)
         stored = checkpoint()
         failure = Failure(
             where=error.label,
@@ -57,7 +56,7 @@ def keeping_failures(
             config=config,
             versions=library_versions(),
         )
-        write_file(path, failure.model_dump_json(indent=1) + "\n")
+        write_file(folder, path.name, failure.model_dump_json(indent=1) + "\n")
         raise RunError(f"{error}\nto do it again, alone: dmil reproduce {path}") from error
 
 
@@ -70,6 +69,6 @@ def read_failure(path: Path) -> Failure:
     if path.is_dir():
         path = path / "failure.json"
     try:
-        return Failure.model_validate_json(read_file(path, MOST_BYTES))
+        return Failure.model_validate_json(read_file(*named(path), MOST_BYTES))
     except (OSError, ValidationError) as error:
         raise UserError(f"{path}: got {error}; wanted a failure.json that a program left behind") from error

@@ -21,6 +21,7 @@ from services.evaluation.results import AdaptationResult, EpisodeResult, Imitati
 from services.evaluation.summary import Evaluation, rates, sub_skill_shares, summary_rows
 from services.rollouts.adaptations import Adaptation, AdaptationOutcome, ImitationErrors, plan_adaptations
 from services.storage.checkpoints import Checkpoint, Checkpoints, iteration_of
+from services.storage.files import inside
 from services.storage.provenance import library_versions
 from services.suites.base import Split, TaskSuite
 from services.tracking.tracker import Tracker
@@ -163,7 +164,7 @@ class Evaluations:
             overlap: evaluate beside meta-training.
         """
         self._runner, self._evaluator, self._checkpoints, self._tracker = runner, evaluator, checkpoints, tracker
-        self._folder = checkpoints.folder.with_name("evaluations")
+        self._run = checkpoints.folder.parent
         self._overlap = overlap
         self._under_way: tuple[Checkpoint, Simulation[AdaptationOutcome]] | None = None
         self.latest: dict[str, Any] = {}
@@ -179,7 +180,7 @@ class Evaluations:
         return [path for path in due if not (self._folder_of(iteration_of(path)) / "episodes.jsonl").exists()]
 
     def _folder_of(self, iteration: int) -> Path:
-        return self._folder / f"{iteration:07d}"
+        return inside(self._run, f"evaluations/{iteration:07d}")
 
     def catch_up(self) -> None:
         """Evaluate the checkpoints whose evaluation was dropped when the run was stopped."""
@@ -198,7 +199,7 @@ class Evaluations:
                 self._record(checkpoint, [outcomes[index] for index in range(len(items))])
 
     def _keeping_failures(self, checkpoint: Checkpoint) -> AbstractContextManager[None]:
-        return keeping_failures(self._folder.parent, self._evaluator.config, lambda: checkpoint.path)
+        return keeping_failures(self._run, self._evaluator.config, lambda: checkpoint.path)
 
     def poll(self) -> None:
         """Record the evaluation under way, if it has come to its end."""
@@ -233,7 +234,6 @@ def write_evaluation(evaluation: Evaluation, folder: Path) -> None:
 
     Each is written whole, the episodes last: where they are, the evaluation is complete.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     write_rows(folder / "adaptations.jsonl", evaluation.adaptations)
     write_rows(folder / "episodes.jsonl", evaluation.episodes)
 

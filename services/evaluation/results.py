@@ -85,7 +85,7 @@ def write_rows(path: Path, rows: Iterable[BaseModel]) -> None:
     Raises:
         DiskFullError: for want of space; the file is then what it was.
     """
-    write_file(path, "".join(row.model_dump_json() + "\n" for row in rows))
+    write_file(path.parent, path.name, "".join(row.model_dump_json() + "\n" for row in rows))
 
 
 def read_rows(path: Path, model: type[Row]) -> list[Row]:
@@ -112,7 +112,7 @@ def read_lines(path: Path) -> Iterator[tuple[int, bytes]]:
             wrote it was killed.
     """
     try:
-        lines = read_file(path, MOST_BYTES).split(b"\n")
+        lines = read_file(path.parent, path.name, MOST_BYTES).split(b"\n")
     except OSError as error:
         raise UserError(f"{path}: got {error.strerror}; wanted a file of JSON lines; make it again") from error
     for number, line in enumerate(lines, start=1):

@@ -16,6 +16,7 @@ from services.cli.escapes import for_markdown
 from services.evaluation.paper_results import Published, figure_of
 from services.evaluation.results import AdaptationResult, EpisodeResult
 from services.storage.checkpoints import Checkpoint
+from services.storage.files import write_file
 from services.suites.base import Split
 
 BEST = 5
@@ -283,6 +284,6 @@ def markdown_rows(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[st
     return [f"| {' | '.join(fields)} |" for fields in (lines[0], ["---"] * len(head), *lines[1:])]
 
 
-def write_summary(summary: Summary, path: Path) -> None:
+def write_summary(summary: Summary, folder: Path) -> None:
     """Write ``summary.json``."""
-    path.write_text(summary.model_dump_json(indent=1) + "\n")
+    write_file(folder, "summary.json", summary.model_dump_json(indent=1) + "\n")

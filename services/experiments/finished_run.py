@@ -12,7 +12,7 @@ from services.evaluation.results import EpisodeResult, EvaluationFolder, read_ro
 from services.evaluation.summary import Summary
 from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoint, Checkpoints
-from services.storage.files import read_json
+from services.storage.files import inside, read_json
 from services.storage.run_folders import find_folder
 from services.tracking.history import Origin, read_metrics, read_origin
 
@@ -63,7 +63,7 @@ class FinishedRun(EvaluationFolder):
             UserError: if the file is not as a run writes it.
         """
         advice = f"write it again: dmil meta-train --resume {self.folder}"
-        return read_json(self.folder / MARK, Summary, MOST_BYTES, f"wanted what a run writes at its end; {advice}")
+        return read_json(self.folder, MARK, Summary, MOST_BYTES, f"wanted what a run writes at its end; {advice}")
 
     @cached_property
     def checkpoint(self) -> Checkpoint:
@@ -93,8 +93,8 @@ class FinishedRun(EvaluationFolder):
     def evaluations(self) -> dict[int, list[EpisodeResult]]:
         """The rows of each evaluation by its iteration: those on the way, and the one of the last checkpoint."""
         on_the_way = {
-            int(path.parent.name): read_rows(path, EpisodeResult)
-            for path in sorted((self.folder / "evaluations").glob("*/episodes.jsonl"))
+            int(path.parent.name): read_rows(inside(self.folder, path.relative_to(self.folder)), EpisodeResult)
+            for path in sorted(self.folder.glob("evaluations/*/episodes.jsonl"))
             if path.parent.name.isdecimal()
         }
         return on_the_way if self.has_gone_on else on_the_way | {self.checkpoint.manifest.iteration: self.episodes}

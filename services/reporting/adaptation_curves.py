@@ -30,7 +30,7 @@ from services.reporting.drawing import (
 )
 from services.reporting.page import DataTable, Part, Prose, Section
 from services.reporting.run_group import MOST_TASKS, policy_after
-from services.storage.files import read_json, write_file
+from services.storage.files import inside, read_json, remove_file, write_file
 
 FOLDER, PLAN, IMITATION = "adaptation", "plan.json", "imitation.jsonl"
 SHOTS = (1, 3, 5, 10)
@@ -96,16 +96,14 @@ def measure(
         UserError: for a task that the run does not have, or if no size of the support set is left.
     """
     plan = _planned(run, tasks, shots, steps, episodes)
-    folder = run.folder / FOLDER
-    folder.mkdir(exist_ok=True)
-    write_file(folder / PLAN, plan.model_dump_json(indent=1) + "\n")
+    write_file(run.folder, f"{FOLDER}/{PLAN}", plan.model_dump_json(indent=1) + "\n")
     for number, count in enumerate(plan.steps, start=1):
         experiment = Experiment(with_evaluation(run.config, plan.at(count)), run.experiment.store)
         evaluator = experiment.evaluator(runner, run.demonstrations, plan.tasks)
         rows_folder = _folder_of(run, count)
         if not _is_measured(rows_folder, evaluator, plan, count):
             console.print(f"{count} fine-tuning steps, {number} of {len(plan.steps)}", markup=False)
-            (rows_folder / IMITATION).unlink(missing_ok=True)
+            remove_file(rows_folder, IMITATION)
             experiment.evaluate(runner, run.demonstrations, run.checkpoint, rows_folder, plan.tasks)
             _measure_imitation(run, runner, evaluator, rows_folder)
     return plan
@@ -152,7 +150,7 @@ def _takes(run: FinishedRun, support: Sequence[Demonstration]) -> bool:
 
 
 def _folder_of(run: FinishedRun, steps: int) -> Path:
-    return run.folder / FOLDER / f"{steps:07d}"
+    return inside(run.folder, f"{FOLDER}/{steps:07d}")
 
 
 def _rows(folder: Path) -> tuple[list[EpisodeResult], list[ImitationResult]]:
@@ -193,11 +191,11 @@ def _plan_of(run: FinishedRun) -> CurvePlan | None:
     Raises:
         UserError: if the file is not as `measure` writes it.
     """
-    path = run.folder / FOLDER / PLAN
-    if not path.exists():
+    name = f"{FOLDER}/{PLAN}"
+    if not (run.folder / name).exists():
         return None
     advice = "wanted what measuring adaptation writes; remove it and measure again"
-    plan = read_json(path, CurvePlan, MOST_BYTES, advice)
+    plan = read_json(run.folder, name, CurvePlan, MOST_BYTES, advice)
     return plan if plan.checkpoint == run.checkpoint.digest else None
 
 

@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from dmil_core.seeding import named_rng
 from dmil_core.statistics import interquartile_mean, performance_profile, profile_band
 from services.evaluation.comparison import DIGITS, Cell, Comparison
 from services.reporting.drawing import DASHES, Picture, colour_of, ink_on, marker_of, panels, to_picture
+from services.storage.files import write_file
 
 APART = 0.17
 """Between two numbers of shots, in rows."""
@@ -40,7 +42,8 @@ def draw_means(comparison: Comparison, path: Path, title: str) -> None:
     """Draw the same as a PNG file."""
     with _means_figure(comparison) as figure:
         figure.suptitle(title, fontsize="medium")
-        figure.savefig(path, dpi=110, facecolor="white")
+        figure.savefig(content := BytesIO(), dpi=110, facecolor="white", format="png")
+    write_file(path.parent, path.name, content.getvalue())
 
 
 def _where(cell: Cell) -> str:

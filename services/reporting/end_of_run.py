@@ -6,18 +6,17 @@ from pathlib import Path
 from services.cli.progress import console
 from services.evaluation.summary import AGAINST_COLLAPSE, Summary, rates, table, table_markdown, write_summary
 from services.storage.checkpoints import Checkpoint
+from services.storage.files import write_file
 from services.tracking.tracker import Tracker
 
-PAGE = "report.html"
-"""In a run's report folder."""
+REPORT, PAGE = "report", "report.html"
+"""The folder of reports in a run's, and the page in it."""
 
 
 def write_report(summary: Summary, folder: Path) -> None:
     """Write ``summary.json``, and the folder ``report`` with the tables."""
-    write_summary(summary, folder / "summary.json")
-    report = folder / "report"
-    report.mkdir(exist_ok=True)
-    (report / "table.md").write_text(table_markdown(summary))
+    write_summary(summary, folder)
+    write_file(folder, f"{REPORT}/table.md", table_markdown(summary))
 
 
 def publish(tracker: Tracker, summary: Summary, folder: Path) -> None:
@@ -27,7 +26,7 @@ def publish(tracker: Tracker, summary: Summary, folder: Path) -> None:
     tracker.metrics(Checkpoint(Path(summary.checkpoint)).manifest.iteration, metrics, anew=True)
     tracker.tags({"mlflow.note.content": table_markdown(summary)})
     for path, destination in (
-        (folder / "report", "report"),
+        (folder / REPORT, REPORT),
         (folder / "summary.json", None),
         (folder / "episodes.jsonl", None),
     ):

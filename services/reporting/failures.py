@@ -12,9 +12,11 @@ from services.evaluation.results import EpisodeResult
 from services.experiments.finished_run import FinishedRun
 from services.experiments.replay import Replay, ReplayedEpisode, ReplayError, replaying
 from services.reporting.drawing import Picture, colour_of, panels, to_picture
+from services.reporting.end_of_run import REPORT
 from services.reporting.film import FORMS, video_settings, write_film
 from services.reporting.page import Clip, Commands, DataTable, Part, Prose, Section
 from services.reporting.video import camera_of, command, name_of, side_of
+from services.storage.files import inside
 from services.suites.base import Measure, measure_of
 
 MOST_TASKS = 3
@@ -188,6 +190,6 @@ def _describe_episodes(word: str, replayed: Sequence[ReplayedEpisode], measure: 
 
 def _film(run: FinishedRun, replayed: ReplayedEpisode) -> Clip:
     side = side_of(run, replayed)
-    path: Path = run.folder / "report" / "videos" / f"{name_of(replayed.row)}.mp4"
+    path: Path = inside(run.folder, f"{REPORT}/videos") / f"{name_of(replayed.row)}.mp4"
     write_film(path, [side])
     return Clip(f"{side.title}: {side.ending}", path)

@@ -157,8 +157,7 @@ def write_film(path: Path, sides: Sequence[Side]) -> None:
                 pixelformat="yuv420p", macro_block_size=2, quality=None, ffmpeg_log_level="error",
                 output_params=["-crf", "27", "-preset", "slow", "-movflags", "+faststart"],
             )  # fmt: skip
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, made.read_bytes())
+        write_file(path.parent, path.name, made.read_bytes())
 
 
 def _write_gif(path: Path, pictures: Iterator[np.ndarray], rate: int) -> None:

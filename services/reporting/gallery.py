@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from services.cli.arguments import parse
 from services.cli.places import announce
 from services.cli.progress import Bar, console
 from services.rollouts.episodes import demonstrate
-from services.storage.files import room_for
+from services.storage.files import write_file
 from services.suites.base import TaskSuite
 from services.suites.registry import open_suite
 from services.suites.rendering import View, picture
@@ -28,8 +29,6 @@ COLUMNS = {"ml45": 10, "kitchen": 4}
 HEIGHT, WIDTH = 180, 240
 MOMENT = 0.6
 """Each picture is taken after this part of the steps that the expert takes to solve the task."""
-MOST_BYTES = 2**22
-"""Of a gallery's file."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,6 @@ def run(arguments: Sequence[str]) -> None:
         camera: str | View | None = getattr(suite, "camera", None)
         if camera is None:
             raise UserError(f"--suites: got {name}, which names no camera; wanted suites whose tasks can be drawn")
-        args.output.mkdir(parents=True, exist_ok=True)
         path = args.output / f"{name}.jpg"
         draw_gallery(suite, camera, args.seed, path, COLUMNS.get(name.partition("-")[0], 5))
         console.print(str(path))
@@ -78,8 +76,8 @@ def draw_gallery(suite: TaskSuite, camera: str | View, seed: int, path: Path, co
             title = _in_lines(task) + "\n(meta-testing)" * tested
             axis.set_title(title, fontsize=7, fontweight="bold" if tested else "normal")
             bar.advance(1, task)
-    with room_for(path, MOST_BYTES):
-        figure.savefig(path, dpi=110, pil_kwargs={"quality": 85})
+    figure.savefig(content := BytesIO(), dpi=110, pil_kwargs={"quality": 85}, format=path.suffix[1:])
+    write_file(path.parent, path.name, content.getvalue())
 
 
 def _in_lines(task: str) -> str:

@@ -8,8 +8,10 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from services.reporting.drawing import Picture
-from services.storage.files import write_file
+from services.storage.files import read_file, write_file
 
+MOST_BYTES = 2**28
+"""Of a film."""
 TYPES = {".mp4": "video/mp4", ".gif": "image/gif"}
 
 
@@ -54,7 +56,8 @@ class Clip:
     @property
     def address(self) -> str:
         """All of it, as a data URL."""
-        return f"data:{self.type};base64,{base64.b64encode(self.path.read_bytes()).decode()}"
+        content = read_file(self.path.parent, self.path.name, MOST_BYTES)
+        return f"data:{self.type};base64,{base64.b64encode(content).decode()}"
 
 
 Part = Prose | Commands | DataTable | Picture | Clip
@@ -88,4 +91,5 @@ def write_page(path: Path, title: str, lead: Sequence[Part], sections: Sequence[
     )
     templates.filters["kind"] = lambda part: type(part).__name__
     kept = [section for section in sections if section.parts]
-    write_file(path, templates.get_template("page.html").render(title=title, lead=lead, sections=kept))
+    page = templates.get_template("page.html").render(title=title, lead=lead, sections=kept)
+    write_file(path.parent, path.name, page)

@@ -18,7 +18,7 @@ from services.experiments.finished_run import FinishedRun
 from services.reporting.adaptation_curves import adaptation_section, measure
 from services.reporting.curves import training_curves
 from services.reporting.embedding import embedding_section
-from services.reporting.end_of_run import PAGE
+from services.reporting.end_of_run import PAGE, REPORT
 from services.reporting.failures import failures_of_run
 from services.reporting.page import Section, write_page
 from services.reporting.provenance import episodes_of_run, origin_of_run
@@ -26,6 +26,7 @@ from services.reporting.rates import rates_of_tasks, table_of_all
 from services.reporting.run_group import group_runs, has_sub_skills
 from services.reporting.settings import settings_of_run
 from services.reporting.sub_skills import sub_skill_sections
+from services.storage.files import inside
 
 Writing = Callable[[FinishedRun], Sequence[Section]]
 
@@ -109,11 +110,10 @@ def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
     finished = FinishedRun.find(args.run, args.runs)
-    path = args.output or finished.folder / "report" / PAGE
+    path = args.output or inside(finished.folder, REPORT) / PAGE
     if path.is_dir():
         raise UserError(f"--output: got {path}, a folder; wanted a file, as {path / PAGE}")
     announce(report=(path, "--output FILE"))
-    path.parent.mkdir(parents=True, exist_ok=True)
     if args.adaptation:
         with open_runner(args.runner, finished.experiment.suite, args.workers) as runner:
             measure(finished, runner)

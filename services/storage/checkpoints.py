@@ -3,8 +3,7 @@
 import json
 import logging
 import math
-import os
-import shutil
+import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,14 +21,25 @@ from dmil_core.methods.registry import method_type
 from dmil_core.networks import Parameters, flatten, unflatten
 from dmil_core.outer_loop import OuterState
 from services.storage.checksums import checked_file, listing, sha256
-from services.storage.files import inside, read_file, room_for, sync
+from services.storage.files import (
+    create_file,
+    inside,
+    making_folder,
+    read_file,
+    remove_abandoned,
+    remove_folder,
+    room_for,
+)
 
 logger = logging.getLogger(__name__)
 
+NAMED = r"iteration-\d{7,}"
+"""Folders of checkpoints."""
 MANIFEST, MARKER = "manifest.json", "manifest.sha256"
 PARAMETERS, OPTIMISER, CONSTANTS = "parameters.safetensors", "optimiser.safetensors", "constants.safetensors"
 MOST_MANIFEST = 2**22
 """Bytes of a manifest."""
+MOST_MARKER = 200
 MOST_TENSORS = 2**32
 """Bytes of all parameters together: a hundred times those of the paper's networks."""
 MOST_CONSTANTS = 2**26
@@ -179,7 +189,8 @@ class Checkpoints:
 
     def all(self) -> list[Path]:
         """Return the checkpoints' folders, oldest first."""
-        return sorted(path for path in self.folder.glob("iteration-*") if path.is_dir())
+        found = (path for path in self.folder.glob("iteration-*") if re.fullmatch(NAMED, path.name))
+        return sorted(path for path in found if path.is_dir())
 
     def newest(self) -> Checkpoint:
         """Read the newest checkpoint that is whole, and name damaged ones that are newer in a warning.
@@ -203,10 +214,9 @@ class Checkpoints:
 
     def _inside(self, path: Path) -> Path:
         try:
-            inside(self.folder, path.name)
+            return inside(self.folder.parent, f"{self.folder.name}/{path.name}")
         except OSError as error:
-            raise CheckpointError(f"{path}: got a link out of {self.folder}; wanted a folder in it") from error
-        return path
+            raise CheckpointError(str(error)) from error
 
     def save(
         self,
@@ -221,7 +231,6 @@ class Checkpoints:
             DiskFullError: for want of space; what was written by then is removed.
         """
         path = self.folder / f"iteration-{state.iteration:07d}"
-        writing = self.folder / f".writing-{os.getpid()}"
         parameters = unflatten(torch.from_numpy(state.parameters), manifest.torch_shapes)
         contents: dict[str, Mapping[str, np.ndarray]] = {
             PARAMETERS: {name: tensor.numpy() for name, tensor in parameters.items()},
@@ -235,20 +244,14 @@ class Checkpoints:
         digests = {name: sha256(content) for name, content in files.items()}
         text = json.dumps({**manifest.model_dump(mode="json"), "files": digests}, indent=1).encode()
         files |= {MANIFEST: text, MARKER: listing({MANIFEST: sha256(text)}).encode()}
-        for abandoned in self.folder.glob(".writing-*"):  # by a writer that was killed
-            shutil.rmtree(abandoned)
-        try:
-            with room_for(path, sum(map(len, files.values()))):
-                writing.mkdir(parents=True)
-                for name, content in files.items():
-                    (writing / name).write_bytes(content)
-                for name in (*files, "."):
-                    sync(writing / name)
-                shutil.rmtree(path, ignore_errors=True)
-                writing.replace(path)
-                sync(self.folder)
-        finally:
-            shutil.rmtree(writing, ignore_errors=True)
+        run, place = self.folder.parent, self.folder.name
+        remove_abandoned(run, place)
+        with (
+            room_for(path, sum(map(len, files.values()))),
+            making_folder(run, f"{place}/{path.name}", instead=True) as made,
+        ):
+            for name, content in files.items():
+                create_file(made, name, content)
         self._prune(needed)
         return path
 
@@ -269,7 +272,7 @@ class Checkpoints:
         whole, best = list(losses), min(scored, key=lambda path: scored[path], default=None)
         for path in self.all() if len(whole) > self.kept else []:
             if path < whole[-self.kept] and path != best and path not in needed and not path.is_symlink():
-                shutil.rmtree(path)
+                remove_folder(self.folder.parent, f"{self.folder.name}/{path.name}")
 
 
 def _read_manifest(path: Path) -> Manifest:
@@ -279,8 +282,8 @@ def _read_manifest(path: Path) -> Manifest:
         CheckpointError: if not.
     """
     try:
-        text = read_file(inside(path, MANIFEST), MOST_MANIFEST)
-        if read_file(inside(path, MARKER), 200).decode("ascii", "replace") != listing({MANIFEST: sha256(text)}):
+        text = read_file(path, MANIFEST, MOST_MANIFEST)
+        if read_file(path, MARKER, MOST_MARKER).decode("ascii", "replace") != listing({MANIFEST: sha256(text)}):
             raise OSError(f"a file whose SHA-256 is not the one in {MARKER}")
         manifest = Manifest.model_validate_json(text)
     except (OSError, ValidationError) as error:

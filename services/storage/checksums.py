@@ -2,12 +2,10 @@
 
 import errno
 import hashlib
-import os
-import stat
 from collections.abc import Sequence
 from pathlib import Path
 
-from services.storage.files import inside, read_file, write_file
+from services.storage.files import open_file, read_file, write_file
 
 MOST_LISTED = 2**16
 """Bytes of a listing."""
@@ -27,16 +25,16 @@ def checked_file(folder: Path, name: str, digest: str | None, most: int) -> byte
     """Return the content of a file in `folder` whose digest is `digest`.
 
     Raises:
-        OSError: if it is missing, a link out of the folder, of more than `most` bytes, or has another digest.
+        OSError: if it is missing, a link, of more than `most` bytes, or has another digest.
     """
-    content = read_file(inside(folder, name), most)
+    content = read_file(folder, name, most)
     _compare(sha256(content), digest, folder / name)
     return content
 
 
 def write_listing(folder: Path, name: str, files: Sequence[str]) -> None:
     """Write the digests of `files`, paths inside `folder`, to the file `name` in it."""
-    write_file(folder / name, listing({file: _digest(folder / file) for file in files}))
+    write_file(folder, name, listing({file: _digest(folder, file) for file in files}))
 
 
 def check_listing(folder: Path, name: str, most: dict[str, int]) -> None:
@@ -45,22 +43,18 @@ def check_listing(folder: Path, name: str, most: dict[str, int]) -> None:
     It must list the files of `most`, each of at most so many bytes.
 
     Raises:
-        OSError: names the file that is missing, too large, a link out of the folder or not as its digest says.
+        OSError: names the file that is missing, too large, a link or not as its digest says.
     """
-    lines = read_file(inside(folder, name), MOST_LISTED).decode("utf-8", "replace").splitlines()
+    lines = read_file(folder, name, MOST_LISTED).decode("utf-8", "replace").splitlines()
     listed = {file: digest for digest, _, file in (line.partition("  ") for line in lines)}
     if len(lines) != len(listed) or listed.keys() != most.keys():
         raise OSError(errno.EBADMSG, f"does not list {', '.join(most)}, each once", str(folder / name))
     for file, bound in most.items():
-        path = inside(folder, file)
-        found = path.stat()
-        if not stat.S_ISREG(found.st_mode) or found.st_size > bound:
-            raise OSError(errno.EFBIG, f"no regular file of at most {bound} bytes", str(path))
-        _compare(_digest(path), listed[file], path)
+        _compare(_digest(folder, file, bound), listed[file], folder / file)
 
 
-def _digest(path: Path) -> str:
-    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+def _digest(folder: Path, name: str, most: int | None = None) -> str:
+    with open_file(folder, name, most) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -1,17 +1,23 @@
-"""Files on disk: written whole or not at all, and read only as far as is sane."""
+"""The one way into a folder: what lies below it is opened by its name there, through no link, and written whole.
+
+A folder may come from a stranger. Its own path is the user's word, and may lead through links; below it nothing may.
+"""
 
 import errno
 import os
+import secrets
 import shutil
 import stat
+import string
 from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
+from contextlib import ExitStack, contextmanager, suppress
+from io import BufferedReader, FileIO
+from pathlib import Path, PurePath
 from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from dmil_core.errors import RunError, UserError, describe_errors
+from dmil_core.errors import RunError, UserError, describe_errors, shorten
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -20,8 +26,26 @@ FULL_IN_WORDS = ("No space left on device", "Disk quota exceeded", "os error 28"
 """How libraries that write by themselves say it."""
 
 
+WRITING = ".writing-"
+"""Begins the name of a folder that is being made; the rest are hexadecimal digits."""
+FOLDER = os.O_RDONLY | os.O_DIRECTORY
+Name = str | PurePath
+"""A path below a folder, without ``..``."""
+
+
 class DiskFullError(RunError):
     """A disk without room for what is to be written."""
+
+
+class ForeignFileError(OSError, UserError):
+    """What a folder of this program's has no place for: a link, a pipe, a device, more bytes than are sane."""
+
+    def __str__(self) -> str:
+        """Return what was found where, and what to do."""
+        return (
+            f"{self.filename}: got {self.strerror}; wanted a plain file or folder; put what is meant in its place, or "
+            "remove it"
+        )
 
 
 @contextmanager
@@ -50,74 +74,246 @@ def _for_want_of_space(error: Exception) -> bool:
     return (isinstance(error, OSError) and error.errno in FULL) or any(words in str(error) for words in FULL_IN_WORDS)
 
 
-def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file beside, sync it and rename it: whoever reads `path` finds what it was, or all of the new content.
+def open_descriptor(root: Path, name: Name, flags: int) -> int:
+    """Return the descriptor of a regular file below a folder; with ``os.O_CREAT`` its folders are made too.
 
     Raises:
-        DiskFullError: for want of space; `path` is then what it was.
+        ForeignFileError: for a link on the way or at its end, and for anything but a regular file.
+        OSError: if it cannot be opened.
+    """
+    path = root / name
+    with _parent(root, name, make=bool(flags & os.O_CREAT)) as folder:
+        descriptor = _open(path, flags, folder)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise ForeignFileError(errno.EINVAL, "no regular file", str(path))
+    return descriptor
+
+
+@contextmanager
+def _parent(root: Path, name: Name, *, make: bool = False) -> Iterator[int]:
+    """Give the descriptor of the folder that `name` lies in."""
+    if make:
+        root.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as opened:
+        path, here = root, os.open(root, FOLDER)
+        opened.callback(os.close, here)
+        for part in _parts(name)[:-1]:
+            path = path / part
+            if make:
+                with suppress(FileExistsError):
+                    os.mkdir(part, dir_fd=here)
+            here = _open(path, FOLDER, here)
+            opened.callback(os.close, here)
+        yield here
+
+
+def _parts(name: Name) -> tuple[str, ...]:
+    parts = PurePath(name).parts
+    if not parts or PurePath(name).is_absolute() or ".." in parts or "\0" in str(name):
+        raise ForeignFileError(errno.EPERM, "a path that lies outside its folder", shorten(str(name)))
+    return parts
+
+
+def _open(path: Path, flags: int, folder: int) -> int:
+    """Open the last part of `path`, which lies in `folder`."""
+    try:  # a pipe without a writer would wait for ever
+        return os.open(path.name, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666, dir_fd=folder)
+    except OSError as error:
+        if error.errno in {errno.ELOOP, errno.ENOTDIR} and path.is_symlink():
+            raise ForeignFileError(errno.ELOOP, "a link, which is not followed", str(path)) from None
+        raise OSError(error.errno, error.strerror, str(path)) from None
+
+
+def open_file(root: Path, name: Name, most: int | None = None) -> BufferedReader:
+    """Open a regular file below a folder for reading.
+
+    Raises:
+        ForeignFileError: as `open_descriptor`, and for one of over `most` bytes.
+        OSError: if there is none.
+    """
+    file = os.fdopen(open_descriptor(root, name, os.O_RDONLY), "rb")
+    if most is not None and (size := os.fstat(file.fileno()).st_size) > most:
+        file.close()
+        raise ForeignFileError(errno.EFBIG, f"{size} bytes, of which at most {most} are read", str(root / name))
+    return file
+
+
+def read_file(root: Path, name: Name, most: int) -> bytes:
+    """Return the content of a regular file of at most `most` bytes below a folder.
+
+    Raises:
+        ForeignFileError: as `open_file`.
+        OSError: if there is none.
+    """
+    with open_file(root, name, most) as file:
+        return file.read(os.fstat(file.fileno()).st_size)  # it makes room for as many bytes as it is asked for
+
+
+def named(path: Path) -> tuple[Path, str]:
+    """Return the folder and the name of a file that the user named, which may be a link: all links are followed."""
+    found = Path(os.path.realpath(path))
+    return found.parent, found.name
+
+
+def append_to(root: Path, name: Name) -> FileIO:
+    """Open a regular file below a folder at its end, unbuffered; it is made if it is not there.
+
+    Raises:
+        ForeignFileError: as `open_descriptor`.
+    """
+    return FileIO(open_descriptor(root, name, os.O_RDWR | os.O_APPEND | os.O_CREAT), "ab")
+
+
+def create_file(root: Path, name: Name, content: bytes) -> None:
+    """Write a new file below a folder, unsynced.
+
+    Raises:
+        FileExistsError: if there is something of that name.
+        ForeignFileError: for a link on the way.
+    """
+    with os.fdopen(open_descriptor(root, name, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb") as file:
+        file.write(content)
+
+
+def write_file(root: Path, name: Name, content: str | bytes) -> None:
+    """Write a file below a folder beside, sync it and rename it; the folders on the way are made.
+
+    Whoever reads it finds what it was, or all of the new content. A link of its name is replaced, not followed.
+
+    Raises:
+        ForeignFileError: for a link on the way.
+        DiskFullError: for want of space; the file is then what it was.
     """
     data = content.encode() if isinstance(content, str) else content
-    beside = path.with_name(f".{path.name}.writing")
-    with room_for(path, len(data)):
+    path = root / name
+    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.writing")
+    with room_for(path, len(data)), _parent(root, name, make=True) as folder:
         try:
-            with beside.open("wb") as file:
+            with os.fdopen(_open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, folder), "wb") as file:
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
-            beside.replace(path)
-        except OSError:
-            beside.unlink(missing_ok=True)
+            os.rename(beside.name, path.name, src_dir_fd=folder, dst_dir_fd=folder)
+        except BaseException:
+            with suppress(FileNotFoundError):
+                os.unlink(beside.name, dir_fd=folder)
             raise
-        sync(path.parent)
+        os.fsync(folder)
+
+
+@contextmanager
+def making_folder(root: Path, name: Name, *, instead: bool = False) -> Iterator[Path]:
+    """Make a folder whole or not at all: what is written into the one given, beside it, is synced and renamed.
+
+    Args:
+        root: the folder that it lies below.
+        name: of the new folder.
+        instead: remove what has that name by then.
+
+    Raises:
+        FileExistsError: if there is one of that name by then.
+        ForeignFileError: for a link on the way.
+    """
+    path = root / name
+    beside = path.with_name(f"{WRITING}{secrets.token_hex(8)}")
+    with _parent(root, name, make=True) as folder:
+        os.mkdir(beside.name, dir_fd=folder)
+        try:
+            yield beside
+            for made in (*beside.rglob("*"), beside):
+                sync(made)
+            if instead:
+                _remove(path.name, folder)
+            try:
+                os.rename(beside.name, path.name, src_dir_fd=folder, dst_dir_fd=folder)
+            except OSError as error:
+                taken = error.errno in {errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR}
+                raise OSError(errno.EEXIST if taken else error.errno, error.strerror, str(path)) from error
+            os.fsync(folder)
+        finally:
+            shutil.rmtree(beside.name, ignore_errors=True, dir_fd=folder)
+
+
+def _remove(name: str, folder: int) -> None:
+    """Remove whatever has a name in a folder; of a link the link itself."""
+    try:
+        os.unlink(name, dir_fd=folder)
+    except IsADirectoryError:
+        shutil.rmtree(name, dir_fd=folder)
+    except FileNotFoundError:
+        pass
+
+
+def remove_abandoned(root: Path, name: Name) -> None:
+    """Remove what killed processes left of folders that they were making in a folder; nobody else may be making one."""
+    for path in (root / name).glob(f"{WRITING}*"):
+        if not path.is_symlink() and path.is_dir() and set(path.name.removeprefix(WRITING)) <= set(string.hexdigits):
+            remove_folder(root, PurePath(name) / path.name)
+
+
+def remove_folder(root: Path, name: Name) -> None:
+    """Remove a folder below a folder, with all that is in it.
+
+    Raises:
+        OSError: if it is a link, or there is none.
+    """
+    with _parent(root, name) as folder:
+        shutil.rmtree(PurePath(name).name, dir_fd=folder)
+
+
+def remove_file(root: Path, name: Name) -> None:
+    """Remove a file below a folder, if it is there; of a link the link itself."""
+    with suppress(FileNotFoundError, NotADirectoryError), _parent(root, name) as folder:
+        os.unlink(PurePath(name).name, dir_fd=folder)
+
+
+def copy_plain(root: Path, name: Name, target: Path) -> None:
+    """Copy a file, or the regular files of a folder, into the folder `target`; links in it are left out, and the like.
+
+    Raises:
+        ForeignFileError: for a link on the way, and for what is neither file nor folder.
+        FileNotFoundError: if there is nothing.
+    """
+    top = inside(root, name)
+    base, found = (top, sorted(top.rglob("*"))) if top.is_dir() else (top.parent, [top])
+    for path in found:
+        if path == top or stat.S_ISREG(path.lstat().st_mode):
+            made = open_descriptor(target, path.relative_to(base), os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+            with os.fdopen(made, "wb") as copy, open_file(root, path.relative_to(root)) as content:
+                shutil.copyfileobj(content, copy)
 
 
 def sync(path: Path) -> None:
     """Have a file's content, or a folder's list of files, reach the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     try:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
 
 
-def read_file(path: Path, most: int) -> bytes:
-    """Return the content of a regular file of at most `most` bytes.
+def inside(root: Path, name: Name) -> Path:
+    """Return the path `name` under `root`, which need not be there.
 
     Raises:
-        OSError: for anything else: nothing there, a folder, a device that never ends, a larger file.
+        ForeignFileError: if it may lie elsewhere: an absolute path, one with ``..``, a link on the way or at its end.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe without a writer would wait for ever
-    with os.fdopen(descriptor, "rb") as file:
-        found = os.fstat(descriptor)
-        if not stat.S_ISREG(found.st_mode):
-            raise OSError(errno.EINVAL, "is no regular file", str(path))
-        if found.st_size > most:
-            raise OSError(errno.EFBIG, f"of {found.st_size} bytes, of which at most {most} are read", str(path))
-        return file.read(found.st_size)  # it makes room for as many bytes as it is asked for
-
-
-def inside(root: Path, name: str) -> Path:
-    """Return the path `name` under `root`, with all links followed.
-
-    Raises:
-        OSError: if it lies elsewhere: an absolute path, one with ``..``, a link that leads out or to itself.
-    """
-    try:
-        path = (root / name).resolve()
-    except RuntimeError as error:  # so Python 3.11 and 3.12 say it
-        raise OSError(errno.ELOOP, "is a link to itself", name) from error
-    if not path.is_relative_to(root.resolve()):
-        raise OSError(errno.EPERM, f"lies outside {root}", name)
+    path = root
+    for part in _parts(name):
+        path = path / part
+        if path.is_symlink():
+            raise ForeignFileError(errno.ELOOP, "a link, which is not followed", str(path))
     return path
 
 
-def read_json(path: Path, model: type[Model], most: int, advice: str) -> Model:
-    """Read a JSON file of at most `most` bytes into a model of pydantic's.
+def read_json(root: Path, name: Name, model: type[Model], most: int, advice: str) -> Model:
+    """Read a JSON file of at most `most` bytes below a folder into a model of pydantic's.
 
     Raises:
         UserError: names the file and what is wrong in it, with `advice`: what was wanted and what to do.
     """
     try:
-        return model.model_validate_json(read_file(path, most))
+        return model.model_validate_json(read_file(root, name, most))
     except ValidationError as error:
-        raise UserError(f"{path}: got {describe_errors(error, separator='; ')}; {advice}") from error
+        raise UserError(f"{root / name}: got {describe_errors(error, separator='; ')}; {advice}") from error

@@ -6,13 +6,14 @@ written last and removed first. So a writer that is killed between two files lea
 
 import os
 import re
-import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import fsspec
 
 from dmil_core.errors import RunError, UserError
+from services.storage.files import create_file, making_folder
 from services.storage.redaction import redacted
 
 STORAGE = "DMIL_STORAGE"
@@ -60,18 +61,38 @@ class Storage:
         except FileNotFoundError:
             return None
 
+    def create(self, name: str, content: bytes, most: int) -> bytes:
+        """Write a file unless there is one of its name, and return what is there then: this content, or another's.
+
+        Of several writers at most one finds its own there where the storage has a conditional write: a folder, S3,
+        Google's and Azure's. Elsewhere it is looked for, written and read again, so that of writers at the same moment
+        the last may win over one that has found its own already.
+        """
+        path = self._path(name)
+        self._files.makedirs(path.rpartition("/")[0], exist_ok=True)
+        try:
+            with self._files.open(path, "xb") as file:
+                file.write(content)
+        except FileExistsError:
+            pass
+        except (NotImplementedError, ValueError):  # no such mode
+            if self.get(name, most) is None:
+                self.put(name, content)
+        return self.get(name, most) or b""
+
     def put_folder(self, name: str, contents: Mapping[str, bytes], marker: str) -> None:
         """Write a folder's files, the marker last; a folder of that name which is there is none until then."""
         self.remove(name, marker)
         for file in sorted(contents, key=lambda file: file == marker):
             self.put(f"{name}/{file}", contents[file])
 
-    def get_folder(self, name: str, folder: Path, files: Mapping[str, int], marker: str) -> bool:
+    def get_folder(self, name: str, root: Path, target: str, files: Mapping[str, int], marker: str) -> bool:
         """Fetch a folder whose marker is there, and return whether it was; who reads it checks it.
 
         Args:
             name: of the folder here.
-            folder: where it goes; it is made by a rename, unless it is there by then.
+            root: the folder below which it goes.
+            target: its name there; it is made by a rename, unless it is there by then.
             files: what is in it besides the marker, and how many bytes each may have at most.
             marker: the name of the file that vouches for them.
 
@@ -81,19 +102,13 @@ class Storage:
         content = self.get(f"{name}/{marker}", 2**20)
         if content is None:
             return False
-        beside = folder.with_name(f".fetching-{os.getpid()}-{folder.name}")
-        try:
+        with suppress(FileExistsError), making_folder(root, target) as made:
             for file, most in files.items():
                 part = self.get(f"{name}/{file}", most)
                 if part is None:
                     raise RunError(f"{self.url}/{name}/{file}: got nothing; wanted what its {marker} vouches for")
-                (beside / file).parent.mkdir(parents=True, exist_ok=True)
-                (beside / file).write_bytes(part)
-            (beside / marker).write_bytes(content)
-            if not folder.exists():
-                beside.replace(folder)
-        finally:
-            shutil.rmtree(beside, ignore_errors=True)
+                create_file(made, file, part)
+            create_file(made, marker, content)
         return True
 
     def committed(self, name: str, marker: str, pattern: str) -> dict[str, bytes]:

@@ -6,45 +6,94 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from uuid import uuid4
 
-from services.storage.checkpoints import FILES, MARKER
+from dmil_core.errors import UserError
+from services.storage.checkpoints import FILES, MARKER, MOST_MARKER, NAMED, Checkpoints
+from services.storage.files import read_file, remove_folder, write_file
+from services.storage.folder_lock import held
 from services.storage.redaction import error_line
 from services.storage.remote import Storage, given_storage
 
 logger = logging.getLogger(__name__)
 
-NAMED = r"iteration-\d{7,}"
-IDENTITY = "mlflow_run.json"
+IDENTITY, SETTINGS = "mlflow_run.json", "config.json"
 RECORDS = (
-    IDENTITY, "tracking.jsonl", "config.json", "metrics.json", "adaptations.jsonl", "episodes.jsonl", "summary.json",
+    IDENTITY, "tracking.jsonl", SETTINGS, "metrics.json", "adaptations.jsonl", "episodes.jsonl", "summary.json",
 )  # fmt: skip
 """What else a run needs to go on, and to be looked at. The first says how far MLflow has taken the second: it is read
 before it and written after it, so that the copy never says that more was taken than it holds."""
+RUNS = "runs"
+CLAIM = "claim"
+"""Whose a name is: the random tag of the run that has it, in its folder and in the storage."""
+MOST_CLAIM = 100
 MOST_RECORDS = 2**30
 SECONDS = 10.0
 """Between looks at the folder."""
+CLAIM_SECONDS = 20.0
+"""So long a storage may take to say whether a name is free."""
 FAREWELL_SECONDS = 60.0
 
 
 class Replica:
     """The copy of one run's folder."""
 
-    def __init__(self, folder: Path, storage: Storage, place: str = "runs") -> None:
+    def __init__(self, folder: Path, storage: Storage, place: str = RUNS) -> None:
         """Name the copy as the folder, in the folder `place` of the storage; nothing is written yet."""
         self._folder, self._storage, self._name = folder, storage, f"{place}/{folder.name}"
         self._copied: dict[str, tuple[float, int]] = {}
+        self._claimed = place != RUNS  # whose names are digests of what makes them
+
+    def claim(self) -> None:
+        """Have the storage note, once, which run has the name there.
+
+        What the storage raises, whatever it is, passes through.
+
+        Raises:
+            UserError: if it is another's.
+        """
+        if self._claimed:
+            return
+        tag, place = self._tag(), f"{self._name}/{CLAIM}"
+        taken = self._get(CLAIM, MOST_CLAIM) is None and self._get(SETTINGS) is not None  # by a version without claims
+        if tag is None:  # so is this one
+            tag, taken = self.new_tag(), False
+        if taken or self._storage.create(place, tag, MOST_CLAIM) != tag:
+            raise UserError(
+                f"--name: got {self._folder.name}, which another run has in {self._storage.url}; wanted a name that "
+                f"none has: give another, or go on with that run: --resume {self._folder.name}"
+            )
+        self._claimed = True
+
+    def new_tag(self) -> bytes:
+        """Give the folder a tag, by which the storage knows its run."""
+        write_file(self._folder, CLAIM, tag := uuid4().hex.encode())
+        return tag
+
+    def _tag(self) -> bytes | None:
+        try:
+            return read_file(self._folder, CLAIM, MOST_CLAIM)
+        except FileNotFoundError:
+            return None
+
+    def _get(self, name: str, most: int = MOST_RECORDS) -> bytes | None:
+        return self._storage.get(f"{self._name}/{name}", most)
 
     def copy(self) -> None:
         """Bring the copy up to date: checkpoints, then the records of what came after.
 
         What the storage raises, whatever it is, passes through; the next call goes on.
+
+        Raises:
+            UserError: if another run has the name there.
         """
+        self.claim()
         self._copy_checkpoints()
         changed = {}
         for name in RECORDS:
             path = self._folder / name
             if path.is_file() and self._copied.get(name) != (state := _state(path)):
-                changed[name] = state, path.read_bytes()
+                changed[name] = state, read_file(self._folder, name, MOST_RECORDS)
         for name in sorted(changed, key=lambda name: name == IDENTITY):
             state, content = changed[name]
             self._storage.put(f"{self._name}/{name}", content)
@@ -53,18 +102,36 @@ class Replica:
     def _copy_checkpoints(self) -> None:
         place = f"{self._name}/checkpoints"
         there = self._storage.committed(place, MARKER, NAMED)
-        here = {path.parent.name: path for path in sorted(self._folder.glob(f"checkpoints/iteration-*/{MARKER}"))}
-        for name, marker in here.items():
+        here = self._here()
+        for name in here:
+            own = f"checkpoints/{name}"
             try:
-                if there.get(name) == marker.read_bytes():
+                if there.get(name) == read_file(self._folder, f"{own}/{MARKER}", MOST_MARKER):
                     continue
-                contents = {file: (marker.parent / file).read_bytes() for file in (*FILES, MARKER)}
+                contents = {
+                    file: read_file(self._folder, f"{own}/{file}", most)
+                    for file, most in {**FILES, MARKER: MOST_MARKER}.items()
+                }
             except FileNotFoundError:  # the run has let go of it meanwhile
                 continue
             self._storage.put_folder(f"{place}/{name}", contents, MARKER)
         if here:
-            for name in there.keys() - here.keys():
+            for name in there.keys() - set(here):
                 self._storage.remove(f"{place}/{name}", MARKER)
+
+    def is_ahead(self) -> bool:
+        """Tell whether the storage has this run, and further than the folder, or the folder has none of it."""
+        tag, newest = self._tag(), self._newest()
+        if tag is not None and tag != self._get(CLAIM, MOST_CLAIM):
+            return False
+        begun = (self._folder / SETTINGS).exists()
+        return newest > max(self._here(), default="") if begun else self._get(SETTINGS) is not None
+
+    def _newest(self) -> str:
+        return max(self._storage.committed(f"{self._name}/checkpoints", MARKER, NAMED), default="")
+
+    def _here(self) -> list[str]:
+        return [path.name for path in Checkpoints(self._folder / "checkpoints", kept=0).all()]
 
     def restore(self) -> bool:
         """Fetch what the folder lacks; return whether there was anything.
@@ -74,22 +141,15 @@ class Replica:
         Raises:
             RunError: if the copy cannot be used.
         """
-        place = f"{self._name}/checkpoints"
-        here = [path.name for path in self._folder.glob("checkpoints/iteration-*")]
-        newest = max(self._storage.committed(place, MARKER, NAMED), default="")
-        if (self._folder / "config.json").exists() and newest <= max(here, default=""):
+        if not self.is_ahead():
             return False
-        records = {name: self._storage.get(f"{self._name}/{name}", MOST_RECORDS) for name in RECORDS}
-        if records["config.json"] is None:
-            return False
-        self._folder.mkdir(parents=True, exist_ok=True)
-        if newest:
-            (self._folder / "checkpoints").mkdir(exist_ok=True)
-            target = self._folder / "checkpoints" / newest
-            self._storage.get_folder(f"{place}/{newest}", target, FILES, MARKER)
+        records = {name: self._get(name) for name in (CLAIM, *RECORDS)}
+        if newest := self._newest():
+            place = f"checkpoints/{newest}"
+            self._storage.get_folder(f"{self._name}/{place}", self._folder, place, FILES, MARKER)
         for name, content in records.items():
             if content is not None:
-                (self._folder / name).write_bytes(content)
+                write_file(self._folder, name, content)
         return True
 
 
@@ -98,19 +158,53 @@ def _state(path: Path) -> tuple[float, int]:
     return status.st_mtime, status.st_size
 
 
+def claim_name(folder: Path) -> None:
+    """Have the storage that ``DMIL_STORAGE`` names note that a new run has its folder's name.
+
+    A storage that does not answer stops no run: the name is claimed before anything is copied there.
+
+    Raises:
+        UserError: if another run has it there, whose copy stays as it is; the new folder is then removed. Or if the
+            URL names no storage.
+    """
+    storage = given_storage()
+    if storage is None:
+        return
+    replica, errors = Replica(folder, storage), list[Exception]()
+    replica.new_tag()
+
+    def claim() -> None:
+        try:
+            replica.claim()
+        except Exception as error:  # noqa: BLE001  whatever a storage raises
+            errors.append(error)
+
+    thread = threading.Thread(target=claim, name="claim", daemon=True)
+    thread.start()
+    thread.join(CLAIM_SECONDS)
+    if any(isinstance(error, UserError) for error in errors):
+        remove_folder(folder.parent, folder.name)
+        raise errors[0]
+    if errors or thread.is_alive():
+        logger.warning(f"{storage.url} does not say whether the name {folder.name} is free there; going on")
+
+
 def restored(folder: Path) -> bool:
     """Fetch a run that the storage has further than its folder; return whether it did.
 
     Raises:
-        UserError: if ``DMIL_STORAGE`` names none.
+        UserError: if ``DMIL_STORAGE`` names none, or another process works in the folder.
         RunError: if the copy cannot be used.
     """
     storage = given_storage()
-    return storage is not None and Replica(folder, storage).restore()
+    if storage is None or not (replica := Replica(folder, storage)).is_ahead():
+        return False
+    with held(folder):
+        return replica.restore()
 
 
 @contextmanager
-def replicated(folder: Path, place: str = "runs", *, restore: bool = False) -> Iterator[None]:
+def replicated(folder: Path, place: str = RUNS, *, restore: bool = False) -> Iterator[None]:
     """Keep a copy of a run's folder while the run goes on, if ``DMIL_STORAGE`` names a storage.
 
     A storage that does not answer never stops a run; the copy is brought up to date when it answers again. One

@@ -3,13 +3,11 @@
 from pathlib import Path
 
 from dmil_core.errors import UserError, shorten
-from services.storage.files import inside
+from services.storage.files import ForeignFileError, inside
 
 
-def new_folder(name: str, runs: Path, mark: str) -> Path:
-    """Return the folder of a new run or sweep; it is not made yet.
-
-    `mark` is the file by which the folder of one that was begun is known.
+def new_name(name: str, runs: Path) -> Path:
+    """Return the folder of a new run or sweep, whose name may be taken by the time that `make_folder` makes it.
 
     Raises:
         UserError: if the name is none, or taken.
@@ -17,9 +15,25 @@ def new_folder(name: str, runs: Path, mark: str) -> Path:
     if name in (".", "..") or Path(name).name != name:
         raise UserError(f"--name: got {shorten(name)}; wanted the name of a folder in {runs}, without any /")
     folder = _inside_runs(runs / name, runs, "--name")
-    if (folder / mark).exists():
-        raise UserError(f"--name: got {folder}, which is taken; wanted a new name, or --resume {folder}")
+    if folder.exists():
+        raise _taken(folder)
     return folder
+
+
+def make_folder(folder: Path) -> None:
+    """Make the folder of a new run or sweep, of two at once for one of them only.
+
+    Raises:
+        UserError: if its name is taken.
+    """
+    try:
+        folder.mkdir(parents=True)
+    except FileExistsError as error:
+        raise _taken(folder) from error
+
+
+def _taken(folder: Path) -> UserError:
+    return UserError(f"--name: got {folder}, which is taken; wanted a new name, or --resume {folder}")
 
 
 def find_folder(name: str, runs: Path, mark: str, flag: str = "--resume") -> Path:
@@ -43,6 +57,6 @@ def _inside_runs(folder: Path, runs: Path, flag: str) -> Path:
     if folder.parent.absolute() == runs.absolute():
         try:
             inside(runs, folder.name)
-        except OSError as error:
+        except ForeignFileError as error:
             raise UserError(f"{flag}: got {folder}, a link out of {runs}; wanted a folder in it") from error
     return folder

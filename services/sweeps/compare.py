@@ -15,8 +15,9 @@ from services.experiments.finished_run import FinishedRun
 from services.reporting.comparison import compare_runs
 from services.reporting.page import Commands
 from services.reporting.side_by_side import write_comparison
+from services.storage.files import inside
 from services.storage.run_folders import find_folder
-from services.sweeps.folders import MARK, SweepFolder
+from services.sweeps.folders import MARK, TABLES, SweepFolder
 from services.sweeps.tables import Tables, comparison_of, tables_of
 
 
@@ -52,9 +53,8 @@ def _of_sweep(name: str, args: Arguments) -> None:
     if args.baseline is not None and args.baseline not in rows:
         raise UserError(f"--baseline: got {args.baseline!r}; wanted one of {', '.join(rows)}")
     comparison = comparison_of(sweep, args.baseline)
-    path = args.output or sweep.path / "tables" / "report.html"
+    path = args.output or inside(sweep.path, TABLES) / "report.html"
     announce(page=(path, "--output FILE"))
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_sweep_page(tables_of(sweep, comparison), comparison, path)
 
 
@@ -65,7 +65,6 @@ def _of_runs(args: Arguments) -> None:
     comparison = compare_runs(runs, args.baseline)
     path = args.output or Path("comparison.html")
     announce(page=(path, "--output FILE"))
-    path.parent.mkdir(parents=True, exist_ok=True)
     again = ["dmil", "report", "compare", *args.names, "--runs", str(args.runs)]
     again += [] if args.baseline is None else ["--baseline", args.baseline]
     lead = [

@@ -20,12 +20,14 @@ from dmil_core.configs import EvaluationConfig, ExperimentConfig
 from dmil_core.errors import UserError
 from services.storage.checksums import sha256
 from services.storage.files import inside, read_json, write_file
+from services.storage.run_folders import make_folder
 from services.sweeps.settings import PlannedTrial, Preset, Sweep, planned
 
 Record = TypeVar("Record", bound=BaseModel)
 MOST_BYTES = 2**22
 MARK = "sweep.json"
 """What a sweep's folder is known by."""
+RESULT, TABLES = "result.json", "tables"
 TRAINED = "trained"
 DIGITS = 24
 """Of a digest, in a folder's name."""
@@ -78,13 +80,13 @@ class SweepFolder:
             UserError: if it is no folder of a sweep.
         """
         self.path, self.runs = path, path.parent
-        self.record = _read(path / MARK, SweepRecord)
+        self.record = _read(path, MARK, SweepRecord)
 
     @classmethod
     def make(cls, path: Path, record: SweepRecord) -> "SweepFolder":
         """Make it, with what the sweep is."""
-        path.mkdir(parents=True, exist_ok=True)
-        write_file(path / MARK, record.model_dump_json(indent=1) + "\n")
+        make_folder(path)
+        write_file(path, MARK, record.model_dump_json(indent=1) + "\n")
         return cls(path)
 
     @cached_property
@@ -94,7 +96,7 @@ class SweepFolder:
 
     def of_trial(self, name: str) -> Path:
         """Return the folder of a trial, which may not be there yet."""
-        return inside(self.path / "trials", name)
+        return inside(self.path, Path("trials", name))
 
     def result(self, name: str) -> TrialResult | None:
         """Return what came of a trial, if it is over.
@@ -102,12 +104,12 @@ class SweepFolder:
         Raises:
             UserError: if the record of it is damaged.
         """
-        path = self.of_trial(name) / "result.json"
-        return _read(path, TrialResult) if path.exists() else None
+        path = self.of_trial(name) / RESULT
+        return _read(self.path, path.relative_to(self.path), TrialResult) if path.exists() else None
 
     def finish(self, name: str, result: TrialResult) -> None:
         """Note what came of a trial."""
-        write_file(self.of_trial(name) / "result.json", result.model_dump_json(indent=1) + "\n")
+        write_file(self.of_trial(name), RESULT, result.model_dump_json(indent=1) + "\n")
 
 
 def trained(runs: Path, config: ExperimentConfig, data: Mapping[str, str]) -> Path:
@@ -126,8 +128,8 @@ def evaluated(home: Path, evaluation: EvaluationConfig, tasks: Sequence[str]) ->
     return home / "evaluated" / sha256(described.encode())[:DIGITS]
 
 
-def _read(path: Path, model: type[Record]) -> Record:
+def _read(root: Path, name: str | Path, model: type[Record]) -> Record:
     try:
-        return read_json(path, model, MOST_BYTES, "start the sweep again, what is trained stays")
+        return read_json(root, name, model, MOST_BYTES, "start the sweep again, what is trained stays")
     except OSError as error:
-        raise UserError(f"{path}: got {error.strerror}; wanted a sweep's folder, as runs/NAME") from error
+        raise UserError(f"{root / name}: got {error.strerror}; wanted a sweep's folder, as runs/NAME") from error

@@ -18,10 +18,10 @@ from services.cli.progress import console
 from services.evaluation.comparison import DIGITS, Cell, Difference, Unpaired
 from services.evaluation.summary import markdown_rows
 from services.reporting.comparison_pictures import draw_means
-from services.storage.files import write_file
+from services.storage.files import inside, write_file
 from services.storage.run_folders import find_folder
 from services.sweeps.compare import write_sweep_page
-from services.sweeps.folders import MARK, SweepFolder
+from services.sweeps.folders import MARK, TABLES, SweepFolder
 from services.sweeps.tables import Sample, Tables, column_of, comparison_of, tables_of
 from services.tracking.tracker import Tracker
 
@@ -133,16 +133,15 @@ def write_tables(sweep: SweepFolder) -> Tables:
     """Write the folder ``tables``: JSON, Markdown, CSV, LaTeX, a plot, a page; of a search also the best settings."""
     comparison = comparison_of(sweep)
     tables = tables_of(sweep, comparison)
-    folder = sweep.path / "tables"
-    folder.mkdir(exist_ok=True)
-    write_file(folder / "tables.json", tables.model_dump_json(indent=1) + "\n")
-    write_file(folder / "table.md", _markdown(tables))
-    write_file(folder / "cells.csv", _csv([_flat(of) for of in tables.cells]))
-    write_file(folder / "differences.csv", _csv([of.model_dump() for of in tables.differences]))
-    write_file(folder / "table.tex", _latex(tables))
+    folder = inside(sweep.path, TABLES)
+    write_file(folder, "tables.json", tables.model_dump_json(indent=1) + "\n")
+    write_file(folder, "table.md", _markdown(tables))
+    write_file(folder, "cells.csv", _csv([_flat(of) for of in tables.cells]))
+    write_file(folder, "differences.csv", _csv([of.model_dump() for of in tables.differences]))
+    write_file(folder, "table.tex", _latex(tables))
     if tables.samples:
         best = yaml.safe_dump(tables.samples[0].settings, sort_keys=False)
-        write_file(folder / "best.yaml", f"# {_origin(tables)}\n{best}")
+        write_file(folder, "best.yaml", f"# {_origin(tables)}\n{best}")
     if tables.cells:
         draw_means(comparison, folder / "table.png", _head(tables))
     write_sweep_page(tables, comparison, folder / "report.html")

@@ -5,11 +5,11 @@ import os
 import time
 from collections.abc import Mapping
 from contextlib import redirect_stdout
+from io import TextIOWrapper
 from pathlib import Path
 
 import numpy as np
 import torch
-from filelock import FileLock
 from pydantic import TypeAdapter
 
 from dmil_core.errors import RunError, UserError
@@ -21,7 +21,8 @@ from services.evaluation.results import EpisodeResult, read_rows
 from services.evaluation.summary import rates, summary_rows
 from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoint, Checkpoints
-from services.storage.files import read_file, write_file
+from services.storage.files import append_to, read_file, write_file
+from services.storage.folder_lock import held
 from services.storage.remote import given_storage
 from services.storage.replication import replicated
 from services.sweeps.folders import TRAINED, SweepFolder, TrialResult, evaluated, trained
@@ -59,9 +60,7 @@ class ReportingTracker(Tracker):
 
 def tracker_of(sweep: SweepFolder, trial: PlannedTrial, kind: type[Tracker] = Tracker) -> Tracker:
     """Return what records a trial as a child of the sweep's MLflow run."""
-    folder = sweep.of_trial(trial.name)
-    folder.mkdir(parents=True, exist_ok=True)
-    return kind(folder, f"dmil-{sweep.record.name}", parent=sweep.path)
+    return kind(sweep.of_trial(trial.name), f"dmil-{sweep.record.name}", parent=sweep.path)
 
 
 def run_trial(folder: Path, name: str, demonstrations: Path, environment: Mapping[str, str]) -> None:
@@ -84,7 +83,7 @@ def run_trial(folder: Path, name: str, demonstrations: Path, environment: Mappin
     assert isinstance(tracker, ReportingTracker)
     tracker.goes_by = f"{sweep.record.sweep.metric}/meta-testing/"
     status = "KILLED"
-    log_file = (sweep.of_trial(name) / "log.txt").open("a", buffering=1)
+    log_file = TextIOWrapper(append_to(sweep.of_trial(name), "log.txt"), "utf-8", line_buffering=True)
     with log_file as log, redirect_stdout(log), console_logging(quiet=False):
         try:
             record_settings(tracker, trial.config)
@@ -111,22 +110,21 @@ def _run(sweep: SweepFolder, trial: PlannedTrial, store: DemoStore, tracker: Tra
         digests = {task: dataset.digest for task, dataset in data.items()}
         tracker.inputs({dataset.id: dataset.digest for dataset in data.values()})
         home = trained(sweep.runs, config, digests)
-        home.mkdir(parents=True, exist_ok=True)
         tracker.tags({"trained": home.name})
         clock.lap("collect")
-        with FileLock(home / ".lock"):  # two sweeps may want it
+        with held(home, wait=True):  # two sweeps may want it
             with replicated(home, TRAINED, restore=True):
                 checkpoints = Checkpoints(home / "checkpoints", config.training.checkpoints_kept)
                 checkpoint = _whole(checkpoints, config.training.iterations)
                 if checkpoint is None:
-                    write_file(home / "config.json", config.model_dump_json(indent=1) + "\n")
+                    write_file(home, "config.json", config.model_dump_json(indent=1) + "\n")
                     newest = checkpoints.newest() if checkpoints.all() else None
                     checkpoint = experiment.train(runner, data, checkpoints, tracker, newest, overlap_evaluation=False)
                     curves = read_metrics(sweep.of_trial(trial.name))
-                    write_file(home / "metrics.json", _METRICS.dump_json(curves))
+                    write_file(home, "metrics.json", _METRICS.dump_json(curves))
                 else:
                     logger.info(f"trained already: {home}")
-                    _copy_curves(home / "metrics.json", tracker)
+                    _copy_curves(home, tracker)
             clock.lap("train")
             tasks = [task for split, task in experiment.tasks if split in sweep.record.sweep.splits]
             folders = {}
@@ -134,7 +132,6 @@ def _run(sweep: SweepFolder, trial: PlannedTrial, store: DemoStore, tracker: Tra
                 evaluated_experiment = Experiment(with_evaluation(config, evaluation), store)
                 folders[row] = evaluated(home, evaluation, tasks)
                 if not (folders[row] / "episodes.jsonl").exists():
-                    folders[row].mkdir(parents=True, exist_ok=True)
                     evaluated_experiment.evaluate(runner, data, checkpoint, folders[row], tasks)
             clock.lap("evaluate")
     finally:
@@ -160,10 +157,10 @@ def _whole(checkpoints: Checkpoints, iterations: int) -> Checkpoint | None:
     return newest if newest is not None and newest.manifest.iteration >= iterations else None
 
 
-def _copy_curves(metrics: Path, tracker: Tracker) -> None:
+def _copy_curves(home: Path, tracker: Tracker) -> None:
     """Record what another trial recorded when it trained."""
-    if metrics.exists():
-        for row in _METRICS.validate_json(read_file(metrics, MOST_BYTES)):
+    if (home / "metrics.json").exists():
+        for row in _METRICS.validate_json(read_file(home, "metrics.json", MOST_BYTES)):
             iteration = int(row.pop("iteration"))
             tracker.metrics(iteration, row)
 

@@ -13,8 +13,9 @@ from dmil_core.errors import UserError
 from services.cli.progress import Bar
 from services.demonstrations.store import data_root
 from services.distributed.cluster import cpus
+from services.storage.files import remove_file
 from services.storage.remote import STORAGE
-from services.sweeps.folders import SweepFolder, TrialResult
+from services.sweeps.folders import RESULT, SweepFolder, TrialResult
 from services.sweeps.trial import HELD_OUT, ITERATION, run_trial, tracker_of
 from services.tracking.links import tracking_uri
 
@@ -114,7 +115,7 @@ def tune_trials(sweep: SweepFolder) -> None:
             f"resources.workers: got {resources.workers} for each trial; the cluster has {cpus()} CPUs; wanted fewer"
         )
     for name in left:
-        (sweep.of_trial(name) / "result.json").unlink(missing_ok=True)
+        remove_file(sweep.of_trial(name), RESULT)
     folder, root = sweep.path.absolute(), data_root().absolute()
     environment = {"MLFLOW_TRACKING_URI": _everywhere(tracking_uri())}
     if STORAGE in os.environ:

@@ -17,6 +17,7 @@ from tyro.conf import Positional
 from dmil_core.errors import RunError, UserError
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
+from services.storage.files import inside
 from services.storage.redaction import error_line, redacted
 from services.storage.run_folders import find_folder
 from services.tracking.delivery import Delivery
@@ -46,8 +47,8 @@ def run(arguments: Sequence[str]) -> None:
     """Run the program.
 
     Raises:
-        UserError: if there is no such run.
-        RunError: if MLflow does not take the records, or another process is delivering them.
+        UserError: if there is no such run, or another process is delivering its records.
+        RunError: if MLflow does not take the records.
     """
     args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
     uri = tracking_uri()
@@ -57,7 +58,8 @@ def run(arguments: Sequence[str]) -> None:
     if args.action == "report":
         _report(folder, uri)
         return
-    for own in (folder, *sorted(spool.parent for spool in folder.glob("trials/*/tracking.jsonl"))):  # of a sweep
+    trials = sorted(spool.parent.relative_to(folder) for spool in folder.glob("trials/*/tracking.jsonl"))  # of a sweep
+    for own in (folder, *(inside(folder, trial) for trial in trials)):
         delivery = Delivery(own, uri)
         try:
             _flush(delivery, own, uri) if args.action == "flush" else _status(delivery)

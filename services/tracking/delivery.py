@@ -2,17 +2,17 @@
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
-from filelock import FileLock, Timeout
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dmil_core.errors import RunError, UserError
 from services.storage.files import read_file, sync, write_file
+from services.storage.folder_lock import held
 from services.tracking.client import connect, set_mlflow_defaults
 from services.tracking.links import artifacts_beside
 from services.tracking.ownership import (
@@ -41,6 +41,8 @@ SENDING_SECONDS = 60.0
 """So have files."""
 ID = "^[0-9a-f]{32}$"
 """Of runs, MLflow's and our own alike: they stand in questions to MLflow."""
+LOCK = "tracking.lock"
+"""Is held by the one that delivers: the run itself, or a flush."""
 
 
 class Identity(BaseModel):
@@ -71,7 +73,7 @@ class Identity(BaseModel):
         """
         path = folder / IDENTITY
         try:
-            return Identity.model_validate_json(read_file(path, IDENTITY_BYTES))
+            return Identity.model_validate_json(read_file(folder, IDENTITY, IDENTITY_BYTES))
         except (OSError, ValidationError) as error:
             got = error.strerror if isinstance(error, OSError) else "; ".join(_problems(error))
             raise UserError(
@@ -86,12 +88,11 @@ class Identity(BaseModel):
         Raises:
             UserError: if it is damaged.
         """
-        path = folder / IDENTITY
-        if not path.exists():
+        if not (folder / IDENTITY).exists():
             made = Identity(
                 tag=uuid4().hex, experiment=experiment, name=folder.name, began=int(time.time() * 1000), parent=parent
             )
-            write_file(path, made.model_dump_json())
+            write_file(folder, IDENTITY, made.model_dump_json())
         return Identity.of(folder)
 
 
@@ -106,7 +107,8 @@ class Delivery:
         """
         set_mlflow_defaults()
         self._folder, self._uri = folder, uri
-        self._lock = FileLock(folder / "tracking.lock", thread_local=False)
+        self._holding = ExitStack()
+        self._is_ours = False
         self._client: MlflowClient | None = None
         self._checked = False
         self._usual = self._limit = SLOW_SECONDS if uri.startswith("http") else OPENING_SECONDS
@@ -133,9 +135,9 @@ class Delivery:
     def busy(self) -> bool:
         """Tell whether another process is at it."""
         try:
-            with self._lock.acquire(blocking=False):
+            with held(self._folder, LOCK):
                 return False
-        except Timeout:
+        except UserError:
             return True
 
     def deliver(self) -> None:
@@ -145,8 +147,7 @@ class Delivery:
         MLflow keeps one of equal metrics, parameters, tags and inputs.
 
         Raises:
-            RunError: if another process is at it.
-            UserError: if a record is damaged.
+            UserError: if another process is at it, or a record is damaged.
             MlflowException: or whatever else MLflow and what is below it raise, if it does not take a record.
         """
         self._take_over()
@@ -166,18 +167,15 @@ class Delivery:
 
     def close(self) -> None:
         """Let others deliver."""
-        self._lock.release()
+        self._holding.close()
+        self._is_ours = False
 
     def _take_over(self) -> None:
         """Be the one that delivers, from where the last one left off."""
-        if self._lock.is_locked:
+        if self._is_ours:
             return
-        try:
-            self._lock.acquire(blocking=False)
-        except Timeout as error:
-            raise RunError(
-                f"{self._folder}: another process, the run itself or a flush, delivers its records; wait for its end"
-            ) from error
+        self._holding.enter_context(held(self._folder, LOCK))
+        self._is_ours = True
         self.identity = Identity.of(self._folder)
         self._offset = self._delivered_bytes()
 
@@ -257,7 +255,7 @@ class Delivery:
             self.identity = Identity.model_validate(self.identity.model_dump() | changed)
         except ValidationError as error:
             raise RunError(f"MLflow answered with no id of its own: {'; '.join(_problems(error))}") from error
-        write_file(self._folder / IDENTITY, self.identity.model_dump_json())
+        write_file(self._folder, IDENTITY, self.identity.model_dump_json())
 
 
 def _problems(error: ValidationError) -> Iterator[str]:

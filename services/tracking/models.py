@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dmil_core.configs import EvaluationConfig
-from services.storage.checkpoints import Checkpoint
-from services.storage.files import inside
+from services.storage.checkpoints import FILES, MARKER, Checkpoint
+from services.storage.files import copy_plain, inside
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -50,7 +50,10 @@ def log_model(client: "MlflowClient", run_id: str, checkpoint: Checkpoint, examp
         run.info.experiment_id, NAME, run_id, {**tags, CHECKPOINT_TAG: checkpoint.digest}, model_type=config.method.name
     )
     with tempfile.TemporaryDirectory() as made:
-        _save(Path(made) / NAME, checkpoint, example, model)
+        copy = Path(made) / checkpoint.path.name  # of what is the checkpoint's: whatever else lies there stays here
+        for name in (*FILES, MARKER):
+            copy_plain(checkpoint.path, name, copy)
+        _save(Path(made) / NAME, checkpoint, copy, example, model)
         client.log_model_artifacts(model.model_id, str(Path(made) / NAME))
     from mlflow.entities import LoggedModelOutput
 
@@ -58,7 +61,7 @@ def log_model(client: "MlflowClient", run_id: str, checkpoint: Checkpoint, examp
     client.finalize_logged_model(model.model_id, "READY")
 
 
-def _save(folder: Path, checkpoint: Checkpoint, example: dict[str, Any], model: "LoggedModel") -> None:
+def _save(folder: Path, checkpoint: Checkpoint, copy: Path, example: dict[str, Any], model: "LoggedModel") -> None:
     """Write a model as MLflow has it, without a pickle."""
     from mlflow.models import Model
     from mlflow.pyfunc import save_model
@@ -66,7 +69,7 @@ def _save(folder: Path, checkpoint: Checkpoint, example: dict[str, Any], model: 
     save_model(
         folder,
         python_model=CODE,
-        artifacts={"checkpoint": str(checkpoint.path)},
+        artifacts={"checkpoint": str(copy)},
         signature=_signature(checkpoint.manifest.config.evaluation),
         input_example=example,
         pip_requirements=[f"{library}=={version(library)}" for library in LIBRARIES],

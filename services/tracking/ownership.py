@@ -96,7 +96,7 @@ def check_run(client: "MlflowClient", uri: str, folder: Path, run_id: str, tag: 
 def _tag_in(folder: Path) -> str | None:
     """Return the tag that a folder has, if it is one of a run."""
     try:
-        return json.loads(read_file(folder / IDENTITY, IDENTITY_BYTES))["tag"]
+        return json.loads(read_file(folder, IDENTITY, IDENTITY_BYTES))["tag"]
     except (OSError, ValueError, LookupError, TypeError):
         return None
 

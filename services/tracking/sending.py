@@ -3,9 +3,11 @@
 from collections.abc import Iterator, Sequence
 from itertools import takewhile
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, TypeVar
 
 from services.storage.checkpoints import Checkpoint, CheckpointError
+from services.storage.files import ForeignFileError, copy_plain, inside
 from services.tracking.models import log_model
 from services.tracking.spool import Artifact, Line, Measured, Trained
 
@@ -80,18 +82,24 @@ def _send_tags(client: "MlflowClient", run_id: str, values: dict[str, str]) -> N
 
 
 def _send_artifact(client: "MlflowClient", run_id: str, folder: Path, value: Artifact) -> None:
-    path = folder / value.path
-    if not path.exists():
-        _send_tags(client, run_id, {f"missing.{value.path}": "was gone before MLflow could be given it"})
-        return
-    send = client.log_artifacts if path.is_dir() else client.log_artifact
-    send(run_id, str(path), value.folder)
+    """Send a file, or the regular files of a folder; what links in it lead to is not the run's, and stays here."""
+    with TemporaryDirectory() as made:
+        try:
+            copy_plain(folder, value.path, Path(made))
+        except FileNotFoundError:
+            missing = "was gone before MLflow could be given it"
+        except ForeignFileError as error:
+            missing = str(error)
+        else:
+            client.log_artifacts(run_id, made, value.folder)
+            return
+    _send_tags(client, run_id, {f"missing.{value.path}": missing})
 
 
 def _send_model(client: "MlflowClient", run_id: str, folder: Path, value: Trained) -> None:
     try:
-        checkpoint = Checkpoint(folder / value.checkpoint)
-    except CheckpointError as error:
+        checkpoint = Checkpoint(inside(folder, value.checkpoint))
+    except (CheckpointError, ForeignFileError) as error:
         _send_tags(client, run_id, {f"missing.{value.checkpoint}": str(error)[:5000]})
     else:
         log_model(client, run_id, checkpoint, value.example.model_dump())

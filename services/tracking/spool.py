@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from dmil_core.errors import UserError
-from services.storage.files import room_for
+from services.storage.files import append_to, open_file, room_for
 
 LONGEST_LINE = 2**22
 NOTE = "mlflow.note.content"
@@ -103,11 +103,11 @@ def read_spool(path: Path, *, line: int = 0, offset: int = 0) -> Iterator[Line]:
     Raises:
         UserError: names the file and the line that is damaged.
     """
-    if not path.exists():
+    try:
+        file = open_file(path.parent, path.name)
+    except FileNotFoundError:
         return
-    if not path.is_file():
-        raise UserError(f"{path}: got no regular file; wanted a file of records; remove it")
-    with path.open("rb") as file:
+    with file:
         file.seek(offset)
         for number, text in enumerate(iter(lambda: file.readline(LONGEST_LINE), b""), line + 1):
             if not text.endswith(b"\n") and len(text) < LONGEST_LINE:
@@ -141,7 +141,7 @@ class Spool:
             if isinstance(line.value, Measured):
                 self._note(line.value)
         self._lock = threading.Lock()
-        self._file = path.open("ab", buffering=0)
+        self._file = append_to(path.parent, path.name)
         self._file.truncate(self._size)
 
     def append(self, kind: str, value: Any) -> None:

@@ -18,6 +18,7 @@ from services import meta_train
 from services.evaluation.results import EpisodeResult
 from services.storage.checkpoints import Checkpoint, Checkpoints
 from services.tracking.models import models_of
+from services.tracking.spool import read_spool
 
 LOSSES = {"high_loss_before", "high_loss_after", "low_loss_before", "low_loss_after", "continuity_loss"}
 
@@ -251,6 +252,53 @@ def test_a_link_out_of_the_folder_of_runs_is_not_followed(complaint, copied_run)
     for arguments in (("--resume", "run"), ("--resume", "runs/run"), ("--preset", "ml10-smoke", "--name", "run")):
         assert "got runs/run, a link out of runs" in complaint(meta_train.run, *arguments)
     assert sorted(Path("elsewhere").rglob("*")) == before
+
+
+def test_a_run_has_one_process_at_a_time_and_goes_on_when_that_is_killed(
+    programs, train, complaint, workplace: Path, wait_for
+):
+    train("run", "--training.iterations", "1")
+    endless = ("--runner", "local", "--training.iterations", "100000", "--training.checkpoint-every", "5")
+    first = programs.start("meta_train", "--resume", "run", *endless)
+    folder = workplace / "runs" / "run"
+    checkpoints = Checkpoints(folder / "checkpoints", 3)
+    wait_for(lambda: len(checkpoints.all()) > 1 or first.poll() is not None, "a checkpoint")
+    assert f"got process {first.pid} of " in complaint(meta_train.run, "--resume", "run", "--runner", "local")
+    os.kill(first.pid, signal.SIGKILL)
+    first.communicate()
+    reached = checkpoints.newest().manifest.iteration
+    assert train("run", "--training.iterations", str(reached + 1), resume=True).manifest.iteration == reached + 1
+    measured = [line.value for line in read_spool(folder / "tracking.jsonl") if line.kind == "metrics"]
+    steps = [metrics.step for metrics in measured if "gradient_norm" in metrics.values]
+    assert steps == sorted(set(steps)), "none twice"
+
+
+def test_nothing_is_written_through_links_in_a_run_s_folder(copied_run, train, complaint, workplace: Path):
+    folder = copied_run(0)
+    victim = workplace / "victim"
+    victim.mkdir()
+    for name in ("summary.json", "report/table.md", "report/report.html"):
+        (folder / name).unlink(missing_ok=True)
+        (victim / Path(name).name).write_text("precious")
+        (folder / name).symlink_to(victim / Path(name).name)
+    (folder / "episodes.jsonl").unlink()
+    (folder / "episodes.jsonl").symlink_to(victim / "new")
+    (folder / "checkpoints" / ".writing-1").symlink_to(victim)
+    train("run", "--training.iterations", "1", resume=True)
+    assert not (folder / "episodes.jsonl").is_symlink(), "replaced"
+    assert {path.read_text() for path in victim.iterdir()} == {"precious"}
+    assert len(list(victim.iterdir())) == 3
+    (folder / "tracking.jsonl").rename(victim / "tracking.jsonl")
+    before = (victim / "tracking.jsonl").read_bytes()
+    (folder / "tracking.jsonl").symlink_to(victim / "tracking.jsonl")
+    assert "runs/run/tracking.jsonl: got a link" in complaint(meta_train.run, "--resume", "run", "--runner", "local")
+    (folder / "tracking.jsonl").unlink()
+    os.mkfifo(folder / "tracking.jsonl")
+    assert "tracking.jsonl: got no regular file" in complaint(meta_train.run, "--resume", "run", "--runner", "local")
+    (folder / "config.json").unlink()
+    os.mkfifo(folder / "config.json")
+    assert "config.json" in complaint(meta_train.run, "--resume", "run", "--runner", "local")
+    assert (victim / "tracking.jsonl").read_bytes() == before
 
 
 @pytest.mark.parametrize(

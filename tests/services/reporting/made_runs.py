@@ -69,6 +69,6 @@ def make_run(
     write_rows(folder / "episodes.jsonl", found)
     write_rows(folder / "adaptations.jsonl", adaptations)
     evaluation = Evaluation(checkpoint, protocol, best, {}, {}, found, adaptations)
-    write_summary(summarise(evaluation, seconds={}, folder=folder), folder / "summary.json")
+    write_summary(summarise(evaluation, seconds={}, folder=folder), folder)
     records = [["metrics", {"step": i, "time": 0, "values": dict(own)}] for i, own in enumerate(metrics, 1)]
     (folder / "tracking.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))

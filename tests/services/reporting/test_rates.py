@@ -42,7 +42,7 @@ def written(folder: Path, episodes: list[EpisodeResult], best: int = 1) -> Finis
         mlflow_run_id=None,
         failed_attempts={},
     )
-    write_summary(summary, folder / "summary.json")
+    write_summary(summary, folder)
     return FinishedRun(folder)
 
 

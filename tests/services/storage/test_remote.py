@@ -68,15 +68,15 @@ def test_a_sealed_folder_is_whole_or_not_there(url: str, tmp_path: Path):
     storage.put_folder("a/b", {"seal": b"s", "one": b"1", "deep/two": b"22"}, "seal")
     assert storage.committed("a", "seal", ".*") == {"b": b"s"}
     assert storage.committed("a", "seal", "c") == {}
-    assert storage.get_folder("a/b", tmp_path / "here", {"one": 1, "deep/two": 2}, "seal")
+    assert storage.get_folder("a/b", tmp_path, "here", {"one": 1, "deep/two": 2}, "seal")
     assert (tmp_path / "here" / "deep" / "two").read_bytes() == b"22"
     with pytest.raises(RunError, match="got 2 bytes; wanted at most 1"):
-        storage.get_folder("a/b", tmp_path / "other", {"deep/two": 1}, "seal")
+        storage.get_folder("a/b", tmp_path, "other", {"deep/two": 1}, "seal")
     with pytest.raises(RunError, match="three: got nothing"):
-        storage.get_folder("a/b", tmp_path / "other", {"three": 1}, "seal")
+        storage.get_folder("a/b", tmp_path, "other", {"three": 1}, "seal")
     assert {path.name for path in tmp_path.iterdir()} <= {"here", "storage"}
     storage.put("a/c/one", b"unsealed")
-    assert not storage.get_folder("a/c", tmp_path / "other", {"one": 10}, "seal")
+    assert not storage.get_folder("a/c", tmp_path, "other", {"one": 10}, "seal")
     assert storage.committed("a", "seal", ".*") == {"b": b"s"}
     storage.remove("a/b", "seal")
     storage.remove("a/never", "seal")
@@ -104,6 +104,50 @@ def test_a_run_whose_folder_is_as_far_is_left_alone(url: str, train, workplace: 
     capsys.readouterr()
     train("run", "--training.iterations", "3", resume=True)
     assert "fetched" not in capsys.readouterr().out
+
+
+def test_of_two_writers_of_a_file_one_is_told_that_it_is_another_s(url: str):
+    storage = Storage(url)
+    assert storage.create("runs/run/claim", b"one", 10) == b"one"
+    assert storage.create("runs/run/claim", b"other", 10) == b"one"
+    assert storage.create("runs/run/claim", b"one", 10) == b"one"
+
+
+def stored(storage: Storage) -> list[bytes | None]:
+    files = [f"runs/run/checkpoints/{name}/{MARKER}" for name in sorted(names(storage))]
+    return [storage.get(name, 10**6) for name in (*files, "runs/run/config.json", "runs/run/claim")]
+
+
+def test_a_name_that_is_taken_in_the_storage_is_refused(url: str, train, complaint, workplace: Path, monkeypatch):
+    train("run", "--training.iterations", "2")
+    before = stored(Storage(url))
+    monkeypatch.chdir(workplace)
+    arguments = ("--preset", "ml10-smoke", "--runner", "local", "--name", "run", "--seed", "1")
+    said = complaint(meta_train.run, *arguments, "--runs", "elsewhere")
+    assert f"--name: got run, which another run has in {url}" in said
+    assert "--resume run" in said
+    assert not list(Path("elsewhere").iterdir())
+    assert stored(Storage(url)) == before
+    Storage(url).remove("runs/run", "claim")
+    Storage(url).put("runs/run/config.json", b"of an older version, without a claim")
+    assert "which another run has" in complaint(meta_train.run, *arguments, "--runs", "elsewhere")
+
+
+def test_a_copy_of_another_run_is_neither_replaced_nor_fetched(url: str, shared_run, workplace: Path, monkeypatch):
+    monkeypatch.delenv(STORAGE)
+    source = shared_run("after-2", "--training.iterations", "2", *QUICK_EVALUATION)
+    storage, ours = Storage(url), Path(shutil.copytree(source, workplace / "one" / "run"))
+    Replica(ours, storage).copy()
+    before = stored(storage)
+    theirs = Path(shutil.copytree(shared_run("after-0", "--training.iterations", "0", *QUICK_EVALUATION), "run"))
+    for _ in range(2):  # a storage that was away at its start is asked later
+        with pytest.raises(UserError, match="which another run has"):
+            Replica(theirs, storage).copy()
+    assert not Replica(theirs, storage).restore()
+    assert stored(storage) == before
+    shutil.rmtree(ours)
+    assert Replica(ours, storage).restore()
+    Replica(ours, storage).copy()
 
 
 KILLED = """

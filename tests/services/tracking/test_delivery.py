@@ -1,5 +1,6 @@
 """Delivery of what waits: all of it and once, by one process at a time."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -139,3 +140,33 @@ def test_an_artifact_that_is_gone_does_not_hold_up_the_others(tmp_path: Path, ml
     run = MlflowClient(mlflow_file).get_run(str(delivery.identity.run_id))
     assert run.info.status == "FINISHED"
     assert run.data.tags["missing.gone.md"] == "was gone before MLflow could be given it"
+
+
+def test_only_files_of_the_run_s_folder_are_sent(tmp_path: Path, mlflow_file: str, monkeypatch):
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", mlflow_file)
+    monkeypatch.chdir(tmp_path)
+    private, run = tmp_path / "private", tmp_path / "run"
+    (private / "deep").mkdir(parents=True)
+    for path in (private / "key", private / "deep" / "key"):
+        path.write_text("PRIVATE KEY")
+    (run / "report" / "own").mkdir(parents=True)
+    (run / "report" / "own" / "table.md").write_text("a table")
+    (run / "report" / "figure").symlink_to(private / "key")
+    (run / "report" / "own" / "more").symlink_to(private)
+    os.mkfifo(run / "report" / "pipe")
+    (run / "notes").symlink_to("report/figure")
+    (run / "folder").symlink_to("../private")
+    tracker = Tracker(run, "a gift")
+    for name in ("notes", "folder", "folder/key", "report/own/more/deep", "report/pipe", "report"):
+        tracker.artifact(run / name)
+    assert tracker.close("FINISHED")
+    client = MlflowClient(mlflow_file)
+    (tmp_path / "sent").mkdir()
+    sent = Path(client.download_artifacts(str(tracker.run_id), "", str(tmp_path / "sent")))
+    assert [
+        path.relative_to(sent) for path in sent.rglob("*") if path.name in ("table.md", "key", "figure", "pipe")
+    ] == [Path("own/table.md")]
+    tags = client.get_run(str(tracker.run_id)).data.tags
+    assert {name for name in tags if name.startswith("missing.")} == {
+        "missing.notes", "missing.folder", "missing.folder/key", "missing.report/own/more/deep", "missing.report/pipe",
+    }  # fmt: skip
