@@ -83,3 +83,13 @@ def test_a_sweep_is_a_job_too(submit, workplace: Path):
     assert "1 finished" in printed
     tables = json.loads((workplace / "runs" / "small" / "tables" / "tables.json").read_text())
     assert tables["trials"] == {"finished": 1}
+
+
+@pytest.mark.thorough
+def test_a_job_in_a_package_of_ray_s_leaves_no_results_there(cluster, tmp_path: Path):
+    (tmp_path / "notes.txt").write_text("a package")
+    command = [*JOB, "submit", "--address", cluster.dashboard, "--working-dir", str(tmp_path), "--"]
+    command += [sys.executable, "-m", "services.collect_demos", "--preset", "ml10-smoke", "--runner", "local"]
+    done = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert re.search(r"error: demonstrations: got /.*/data; Ray deletes that .* DMIL_DATA=FOLDER; a job", done.stdout)
