@@ -82,7 +82,7 @@ def _carry_out(args: Arguments, checkpoint: Checkpoint, experiment: Experiment) 
     show(summary)
     if promotion is not None:
         for line in promotion.decide(evaluation, args.output):
-            console.print(line, markup=False, soft_wrap=True)
+            console.print(line, soft_wrap=True)
 
 
 def _opened(path: Path) -> Checkpoint:

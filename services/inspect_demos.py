@@ -41,7 +41,7 @@ def run(arguments: Sequence[str]) -> None:
     console.print(_table(place, episodes, suite))
     problems = [*_problems(episodes, suite)]
     for problem in problems:
-        console.print(problem, markup=False)
+        console.print(problem)
     console.print(f"{len(problems)} things are wrong" if problems else "nothing is wrong with it")
 
 

@@ -186,7 +186,7 @@ def _start(settings: Arguments) -> None:
         f"jobs:          {dashboard}, for example:\n",
         f"{auth} {ray} job submit --address {dashboard} -- {job}\n",
     ):
-        console.print(line, soft_wrap=True, markup=False)
+        console.print(line, soft_wrap=True)
     console.print("to stop both: make cluster-stop")
 
 
@@ -347,7 +347,7 @@ def _stop(folder: Path) -> None:
     elif record.temporary.exists():
         console.print(
             f"{folder / 'cluster.json'}: temporary: got {record.temporary}, which was not made for this cluster: it "
-            "stays", soft_wrap=True, markup=False,
+            "stays", soft_wrap=True,
         )  # fmt: skip
     (folder / "cluster.json").unlink()
     console.print(f"stopped: {len(processes)} processes" if processes else "nothing of it was running any more")

@@ -157,7 +157,7 @@ def _read(arguments: Sequence[str]) -> tuple[Arguments, Path]:
     runs = early.runs or Arguments.runs
     wanted = Path(early.resume) if Path(early.resume).name != early.resume else runs / early.resume
     if restored(wanted):
-        console.print(f"fetched from {redacted(os.environ[STORAGE])}: {wanted}", markup=False)
+        console.print(f"fetched from {redacted(os.environ[STORAGE])}: {wanted}")
     folder = find_folder(early.resume, runs, MARK)
     try:
         before = ExperimentConfig.model_validate_json(read_file(folder, MARK, MOST_BYTES))

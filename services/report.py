@@ -31,7 +31,7 @@ def run(arguments: Sequence[str]) -> None:
     if arguments and arguments[0] in {"--help", "-h"}:
         console.print("usage: python -m services.report KIND [--help]\n")
         for kind, module in KINDS.items():
-            console.print(f"  {kind:10}{(import_module(module).__doc__ or '').splitlines()[0]}", markup=False)
+            console.print(f"  {kind:10}{(import_module(module).__doc__ or '').splitlines()[0]}")
         return
     if not arguments or arguments[0] not in KINDS:
         got = arguments[0] if arguments else "nothing"

@@ -108,7 +108,7 @@ def _carry_out(sweep: SweepFolder) -> None:
     show(tables, sweep)
     console.print("seconds: " + ", ".join(f"{phase} {spent:.0f}" for phase, spent in clock.seconds.items()))
     for line in [*tracker.address_lines, *_side_by_side(sweep)]:
-        console.print(line, markup=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)
     if failed := [name for name in sweep.trials if (result := sweep.result(name)) and result.status == "failed"]:
         raise RunError(
             f"{len(failed)} of {len(sweep.trials)} trials failed, see above; the others are in the table; to try them "

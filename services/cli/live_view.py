@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from services.cli.colours import colour_of
+from services.cli.escapes import for_terminal
 
 LABEL, WIDEST = 14, 80
 """Columns of the labels, and of the whole: a wider screen would leave parts behind when its terminal gets narrower."""
@@ -200,7 +201,7 @@ def _describe_workers(workers: Workers) -> str:
 def _packed(phrases: Iterable[str], width: int) -> Text:
     """Put phrases into lines of at most `width` columns, none broken unless it is longer by itself."""
     lines = [""]
-    for phrase in filter(None, phrases):
+    for phrase in map(for_terminal, filter(None, phrases)):
         longer = f"{lines[-1]}   {phrase}" if lines[-1] else phrase
         if len(longer) <= width or not lines[-1]:
             lines[-1] = longer

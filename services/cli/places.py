@@ -30,4 +30,4 @@ def announce(**places: tuple[Path | None, str]) -> None:
             """'{"env_vars": {"NAME": "VALUE"}}'"""
         )
     for what, path in resolved.items():
-        console.print(f"{what}: {path}", markup=False, soft_wrap=True)
+        console.print(f"{what}: {path}", soft_wrap=True)

@@ -54,7 +54,7 @@ class _ConsoleHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Print a record."""
         level = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
-        console.print(f"{level}{record.getMessage()}", markup=False)
+        console.print(f"{level}{record.getMessage()}")
 
 
 @contextmanager
@@ -116,7 +116,7 @@ class Bar:
         pace = self._pace()
         self._line_at, self._line_done = time.monotonic(), pace.done
         parts = [f"{self._name} {pace.done}/{pace.total}, {pace.line}", self._status().line]
-        console.print("; ".join(filter(None, parts)), markup=False)
+        console.print("; ".join(filter(None, parts)))
 
     def __enter__(self) -> "Bar":
         """Begin to show."""

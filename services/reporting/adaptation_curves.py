@@ -102,7 +102,7 @@ def measure(
         evaluator = experiment.evaluator(runner, run.demonstrations, plan.tasks)
         rows_folder = _folder_of(run, count)
         if not _is_measured(rows_folder, evaluator, plan, count):
-            console.print(f"{count} fine-tuning steps, {number} of {len(plan.steps)}", markup=False)
+            console.print(f"{count} fine-tuning steps, {number} of {len(plan.steps)}")
             remove_file(rows_folder, IMITATION)
             experiment.evaluate(runner, run.demonstrations, run.checkpoint, rows_folder, plan.tasks)
             _measure_imitation(run, runner, evaluator, rows_folder)

@@ -52,4 +52,4 @@ def show(summary: Summary, addresses: Sequence[str] = ()) -> None:
     page = Path(summary.report) / PAGE
     console.print(f"checkpoint: {summary.checkpoint}\nreport: {page if page.exists() else summary.report}")
     for line in addresses:
-        console.print(line, markup=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)

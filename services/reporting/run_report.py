@@ -120,5 +120,5 @@ def run(arguments: Sequence[str]) -> None:
     sections = _all_sections(videos=args.videos)
     with Bar("report", len(sections)) as bar:
         write_run_page(finished, path, sections, lambda: bar.advance(1))
-    console.print(f"report: {path} ({path.stat().st_size / 1e6:.1f} MB)", markup=False)
-    console.print(f"open it in a browser: {path.absolute().as_uri()}", markup=False)
+    console.print(f"report: {path} ({path.stat().st_size / 1e6:.1f} MB)")
+    console.print(f"open it in a browser: {path.absolute().as_uri()}")

@@ -56,10 +56,10 @@ def run(arguments: Sequence[str]) -> None:
     with replaying(finished) as replay:
         sides, replayed = _sides(replay, row, FORMS[args.format], demonstration=args.demonstration)
     if replayed.difference is not None:
-        console.print(f"warning: {replayed.difference}; the film shows what came of it here", markup=False)
+        console.print(f"warning: {replayed.difference}; the film shows what came of it here")
     write_film(path, sides)
-    console.print(f"{sides[-1].title}: {sides[-1].ending}", markup=False)
-    console.print(f"{path}, {path.stat().st_size // 1024} KB", markup=False)
+    console.print(f"{sides[-1].title}: {sides[-1].ending}")
+    console.print(f"{path}, {path.stat().st_size // 1024} KB")
 
 
 def _row_of(finished: FinishedRun, args: Arguments) -> EpisodeResult:

@@ -99,9 +99,9 @@ def show(tables: Tables, sweep: SweepFolder) -> None:
             view.add_row(*_difference_fields(pair, digits))
         console.print(view)
     for pair in tables.unpaired:
-        console.print(_not_compared(pair), markup=False)
+        console.print(_not_compared(pair))
     for name, error in tables.failed.items():
-        console.print(f"failed: {name}: {error}", markup=False)
+        console.print(f"failed: {name}: {error}")
     console.print(f"tables: {sweep.path / 'tables'}")
     console.print(f"page: {sweep.path / 'tables' / 'report.html'}")
 

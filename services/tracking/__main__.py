@@ -74,7 +74,7 @@ def _serve(uri: str, port: int) -> NoReturn:
     from services.tracking.server import server_command, server_environment
 
     token = secrets.token_urlsafe()
-    console.print(f"MLflow: http://127.0.0.1:{port}\nuser:   any\npassword: {token}", markup=False, soft_wrap=True)
+    console.print(f"MLflow: http://127.0.0.1:{port}\nuser:   any\npassword: {token}", soft_wrap=True)
     console.print("MLflow's own messages follow; Ctrl-C ends it")
     command = server_command(artifacts_beside(uri) or Path("mlartifacts"), port)
     os.execve(sys.executable, command, {**os.environ, **server_environment(uri, token)})
