@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dmil_core.errors import UserError
 from services.storage.private import bypass_proxies, private_folder
@@ -75,28 +75,47 @@ def named_address() -> str | None:
 
 
 def _join(address: str) -> None:
-    """Join a cluster; Ray itself would try for minutes where none listens.
+    """Join a cluster.
 
     Raises:
         UserError: if nothing answers there as a Ray of this version, with this token.
     """
-    import grpc
     import ray
+    from ray._private.services import canonicalize_bootstrap_address_or_die  # finds `auto`
     from ray.exceptions import RayError
 
-    host = address.removeprefix("ray://")
-    wanted = "wanted HOST:PORT of a Ray head that runs, or unset it for a Ray of this run's own"
+    host, wanted = address.removeprefix("ray://"), "wanted a Ray head that runs, as HOST:PORT, or none: unset it"
     if "://" in host:
         raise UserError(f"RAY_ADDRESS: got {redacted(address)}, perhaps of a dashboard, which takes jobs; {wanted}")
     try:
-        if address != "auto" and os.environ.get("RAY_USE_TLS", "0") == "0":
-            with grpc.insecure_channel(host, [("grpc.enable_http_proxy", 0)]) as channel:
-                grpc.channel_ready_future(channel).result(SECONDS_TO_ANSWER)
-        ray.init(address, job_config=_job_config(), logging_level=logging.WARNING)
-    except grpc.FutureTimeoutError:
-        raise UserError(f"RAY_ADDRESS: got {address}, where no Ray answers; {wanted}") from None
+        refusal = _refusal(canonicalize_bootstrap_address_or_die(host))
+        if refusal is None:
+            ray.init(address, job_config=_job_config(), logging_level=logging.WARNING)
+            return
     except (ConnectionError, RuntimeError, ValueError, RayError) as error:
-        raise UserError(f"RAY_ADDRESS: got {address}, which cannot be joined: {error_line(error)}; {wanted}") from error
+        refusal = f"none can be joined: {error_line(error)}"
+    raise UserError(f"RAY_ADDRESS: got {address}, where {refusal}; {wanted}")
+
+
+def _refusal(host: str) -> str | None:
+    """Return why a cluster would not be joined where Ray itself would try for minutes, or None."""
+    import grpc
+    from ray._private.authentication.authentication_token_setup import maybe_enable_token_auth_if_token_available
+    from ray._private.grpc_utils import init_grpc_channel  # has Ray's token and TLS
+
+    maybe_enable_token_auth_if_token_available(warn_if_disabled=False)  # as ray.init does
+    channel: Any = init_grpc_channel(host, [("grpc.enable_http_proxy", 0)])
+    try:
+        grpc.channel_ready_future(channel).result(SECONDS_TO_ANSWER)
+        channel.unary_unary("/ray.rpc.NodeInfoGcsService/GetClusterId")(b"", timeout=SECONDS_TO_ANSWER)
+    except grpc.FutureTimeoutError:
+        return "no Ray answers"
+    except grpc.RpcError as error:
+        if error.code() == grpc.StatusCode.UNAUTHENTICATED:  # pyright: ignore[reportAttributeAccessIssue]
+            return "another token is asked for (RAY_AUTH_MODE=token, RAY_AUTH_TOKEN_PATH=FILE)"
+    finally:
+        channel.close()
+    return None
 
 
 def cpus() -> int:

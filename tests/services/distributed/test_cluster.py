@@ -1,6 +1,8 @@
 """Which cluster a program works in, and what it says of one that it cannot join."""
 
 import os
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -8,8 +10,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 
 from dmil_core.errors import UserError
-from services.distributed import cluster
+from services.distributed import cluster as own
 from services.distributed.cluster import joined, named_address
+from tests.services.conftest import Cluster
 
 
 @pytest.fixture
@@ -34,10 +37,10 @@ def named(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
 @pytest.mark.parametrize("address", ["127.0.0.1:{free}", "ray://127.0.0.1:{free}", "127.0.0.1:{web}", "no-such-host:1"])
 def test_an_address_where_no_ray_answers_is_named_soon(named, free_port, web_server: int, address: str):
     address = address.format(free=free_port(), web=web_server)
-    named.setattr(cluster, "SECONDS_TO_ANSWER", 0.5)
+    named.setattr(own, "SECONDS_TO_ANSWER", 0.5)
     named.setenv("RAY_ADDRESS", address)
     with (
-        pytest.raises(UserError, match=f"^RAY_ADDRESS: got {address}, where no Ray answers; wanted HOST:PORT"),
+        pytest.raises(UserError, match=f"^RAY_ADDRESS: got {address}, where no Ray answers; wanted a Ray head"),
         joined(),
     ):
         pass
@@ -50,6 +53,16 @@ def test_the_address_of_a_dashboard_is_told_without_its_secrets(named):
         joined(),
     ):
         pass
+
+
+@pytest.mark.parametrize(
+    "environment", [{"RAY_AUTH_MODE": "disabled"}, {"RAY_AUTH_TOKEN": "0" * 64}], ids=["no token", "a wrong token"]
+)
+def test_a_cluster_of_another_token_is_told_soon(cluster: Cluster, environment: dict[str, str]):
+    code = "from services.distributed.cluster import joined\nwith joined(): pass"
+    given = {**os.environ, **environment, "RAY_ADDRESS": cluster.address}
+    program = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=given)
+    assert f"UserError: RAY_ADDRESS: got {cluster.address}, where another token is asked for" in program.stderr
 
 
 @pytest.mark.parametrize(
