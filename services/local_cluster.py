@@ -26,7 +26,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from dmil_core.errors import RunError, UserError, describe_errors
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
-from services.storage.files import read_file, write_file
+from services.storage.files import append_to, read_file, write_file
 from services.storage.private import bypass_proxies, make_private_folder
 from services.tracking.server import LOGINS, server_command, server_environment
 
@@ -160,7 +160,8 @@ def _start(settings: Arguments) -> None:
     started: list[Started] = []
     try:
         for server in _servers(settings, temporary, dashboard, mlflow):
-            with (folder / f"{server.name}.log").open("w") as log:
+            write_file(folder, f"{server.name}.log", b"")
+            with append_to(folder, f"{server.name}.log") as log:
                 process = subprocess.Popen(
                     server.command, env=environment, stdout=log, stderr=log, stdin=subprocess.DEVNULL,
                     start_new_session=True,
@@ -237,7 +238,7 @@ def _token(folder: Path) -> Path:
         path.unlink(missing_ok=True)
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
             file.write(secrets.token_hex(32))
-    if os.environ.get("RAY_AUTH_TOKEN", (token := path.read_text())) != token:
+    if os.environ.get("RAY_AUTH_TOKEN", (token := read_file(folder, path.name, MOST_BYTES).decode())) != token:
         raise UserError(
             f"RAY_AUTH_TOKEN: got another token than that in {path}, perhaps of an earlier cluster; wanted none, or "
             "the same: unset RAY_AUTH_TOKEN"

@@ -23,6 +23,10 @@ WITHOUT_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}
 """How a file system says that it has none."""
 
 
+class FolderHeldError(UserError):
+    """A folder that another process works in."""
+
+
 class Holder(BaseModel):
     """The process that works in a folder."""
 
@@ -44,14 +48,14 @@ def held(folder: Path, name: str = LOCK, *, wait: bool = False) -> Iterator[None
 
     Raises:
         DiskFullError: for want of space.
-        UserError: names the process that holds the folder.
+        FolderHeldError: names the process that holds the folder.
     """
     descriptor = open_descriptor(folder, name, os.O_RDWR | os.O_CREAT)
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise UserError(
+            raise FolderHeldError(
                 f"{folder}: got {_holder(descriptor)} at work in it; wanted a folder that no other process works in; "
                 "wait until that one ends, or stop it"
             ) from error

@@ -64,19 +64,19 @@ class Storage:
     def create(self, name: str, content: bytes, most: int) -> bytes:
         """Write a file unless there is one of its name, and return what is there then: this content, or another's.
 
-        Of several writers at most one finds its own there where the storage has a conditional write: a folder, S3,
-        Google's and Azure's. Elsewhere it is looked for, written and read again, so that of writers at the same moment
-        the last may win over one that has found its own already.
+        A folder and S3 write it in one step, so that of several writers one finds its own there. Other kinds do so as
+        far as their library opens files with the mode ``xb``; else, of writers in the same moment, the last may win
+        over one that has found its own already.
         """
         path = self._path(name)
-        self._files.makedirs(path.rpartition("/")[0], exist_ok=True)
-        try:
-            with self._files.open(path, "xb") as file:
-                file.write(content)
-        except FileExistsError:
-            pass
-        except (NotImplementedError, ValueError):  # no such mode
-            if self.get(name, most) is None:
+        if self.get(name, most) is None:
+            self._files.makedirs(path.rpartition("/")[0], exist_ok=True)
+            try:
+                with self._files.open(path, "xb") as file:
+                    file.write(content)
+            except FileExistsError:
+                pass
+            except (NotImplementedError, ValueError):  # no such mode
                 self.put(name, content)
         return self.get(name, most) or b""
 

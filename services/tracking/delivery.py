@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dmil_core.errors import RunError, UserError
 from services.storage.files import read_file, sync, write_file
-from services.storage.folder_lock import held
+from services.storage.folder_lock import FolderHeldError, held
 from services.tracking.client import connect, set_mlflow_defaults
 from services.tracking.links import artifacts_beside
 from services.tracking.ownership import (
@@ -137,7 +137,7 @@ class Delivery:
         try:
             with held(self._folder, LOCK):
                 return False
-        except UserError:
+        except FolderHeldError:
             return True
 
     def deliver(self) -> None:
