@@ -1,6 +1,7 @@
 """Evaluation on its own: the rows that the run itself found, other shots by flag, and damage reported by file."""
 
 import json
+import os
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from services import evaluate
 from services.demonstrations.store import DemoStore
 from services.evaluation.results import EpisodeResult, read_rows
+from services.storage.folder_lock import held
 
 
 @pytest.fixture
@@ -53,6 +55,14 @@ def test_a_second_evaluation_replaces_the_rows_of_the_first():
     for _ in range(2):
         evaluate.run(["--checkpoint", "runs/run", "--runner", "local"])
     assert len(Path("evaluation/episodes.jsonl").read_text().splitlines()) == 4
+
+
+@pytest.mark.usefixtures("trained")
+def test_a_folder_that_another_evaluation_writes_to_is_refused(complaint):
+    with held(Path("evaluation")):
+        said = complaint(evaluate.run, "--checkpoint", "runs/run", "--runner", "local")
+    assert f"evaluation: got process {os.getpid()} of" in said
+    assert not Path("evaluation/episodes.jsonl").exists()
 
 
 @pytest.mark.parametrize(

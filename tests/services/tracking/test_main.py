@@ -8,6 +8,7 @@ from mlflow import MlflowClient
 
 from dmil_core.errors import RunError, UserError
 from services.storage.checkpoints import Checkpoint
+from services.storage.files import ForeignFileError
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.delivery import Delivery, Identity
 from services.tracking.models import models_of
@@ -71,6 +72,12 @@ def test_one_process_delivers_at_a_time(tmp_path: Path, mlflow_file: str, monkey
     assert "is delivering them" in capsys.readouterr().out
     one.close()
     tracking_program(["flush", str(tmp_path)])
+    (tmp_path / "tracking.lock").unlink()
+    (tmp_path / "tracking.lock").symlink_to("victim")
+    for action in ("flush", "status"):
+        with pytest.raises(ForeignFileError, match=r"tracking\.lock: got a link"):
+            tracking_program([action, str(tmp_path)])
+    assert not (tmp_path / "victim").exists()
 
 
 def test_what_holds_no_run_is_refused(tmp_path: Path, complaint):
