@@ -2,6 +2,7 @@
 PYTHON := $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALLED := .venv/installed
+PROCESSES := 3
 
 .DEFAULT_GOAL := help
 .PHONY: help setup train cluster cluster-stop test test-all missing tools mutants check-deploy audit clean
@@ -42,12 +43,12 @@ endef
 test test-all: export OMP_NUM_THREADS = 1
 test: setup ## what proves the product, in some minutes: lint, format, types, imports and tests
 	$(CHECK)
-	$(BIN)/python -m pytest --ignore tests/deploy -m "not thorough" -n 2 --dist loadfile --no-loadscope-reorder --durations 10
+	$(BIN)/python -m pytest --ignore tests/deploy -m "not thorough" -n $(PROCESSES) --dist loadfile --no-loadscope-reorder --durations 10
 
 test-all: tools setup ## everything, also what wants a browser, a database, promtool, kubectl and half an hour
 	@$(INSTALL_CHECKERS)
 	$(CHECK)
-	$(BIN)/python -m pytest -m "not alone" -n 2 --dist loadfile --no-loadscope-reorder --durations 20
+	$(BIN)/python -m pytest -m "not alone" -n $(PROCESSES) --dist loadfile --no-loadscope-reorder --durations 20
 	$(BIN)/python -m pytest -m alone --durations 20
 
 MISSING = $(strip \
