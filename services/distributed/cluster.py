@@ -58,7 +58,7 @@ def joined(workers: int | None = None) -> Iterator[None]:
                 log_to_driver=False,
                 _node_ip_address="127.0.0.1",
                 _temp_dir=str(folder / "ray"),
-                _system_config={"enable_metrics_collection": False},  # it would be served to everybody
+                _system_config={"enable_metrics_collection": False},  # they would be served to everybody
             )
         else:
             stack.callback(ray.shutdown)

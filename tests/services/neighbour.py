@@ -11,6 +11,7 @@ import os
 import socket
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import grpc
@@ -31,7 +32,8 @@ REQUESTS = {
     ],
 }  # fmt: skip
 REFUSED = {400, 401, 403, 404, 405}
-FIGURES = b"# HELP"
+FIGURES = b"# HELP "
+"""With which what Prometheus asks for begins."""
 CALLS = [
     "NodeInfoGcsService/GetAllNodeInfo", "InternalKVGcsService/InternalKVKeys", "NodeManagerService/GetNodeStats",
     "NodeManagerService/RequestWorkerLease", "ObjectManagerService/Push", "ObjectManagerService/Pull",
@@ -40,7 +42,10 @@ CALLS = [
     "RuntimeEnvService/GetOrCreateRuntimeEnv", "RayletDriver/Init", "RayletDriver/Schedule",
     "events.EventAggregatorService/AddEvents",
 ]  # fmt: skip
-CLOSED = {grpc.StatusCode.UNAUTHENTICATED, grpc.StatusCode.UNIMPLEMENTED, grpc.StatusCode.PERMISSION_DENIED}
+CLOSED = {
+    grpc.StatusCode.UNAUTHENTICATED, grpc.StatusCode.PERMISSION_DENIED, grpc.StatusCode.UNIMPLEMENTED,
+    grpc.StatusCode.UNAVAILABLE,  # a worker that has ended meanwhile
+}  # fmt: skip
 SECONDS = 5.0
 
 
@@ -55,7 +60,8 @@ def main() -> None:
     paths = [path for folder in folders for path in (folder, *folder.rglob("*"))]
     for process in processes:
         paths.append(Path(f"/proc/{process.pid}/environ"))
-        paths += [Path(file.path) for file in process.open_files() if file.path.startswith("/dev/shm")]
+        with suppress(psutil.Error):  # one that has ended meanwhile
+            paths += [Path(file.path) for file in process.open_files() if file.path.startswith("/dev/shm")]
     grpc.insecure_channel("127.0.0.1:1").close()  # it imports too
     os.setgroups([])
     os.setgid(NOBODY)
@@ -103,13 +109,13 @@ def _port(port: int) -> Iterator[str]:
         try:
             asked.request(method, path, "{}" if method == "POST" else None, {"Content-Type": "application/json"})
             answer = asked.getresponse()
-            text = answer.read(len(FIGURES))
+            text = answer.read(len(FIGURES) + 20)
         except (OSError, http.client.HTTPException):
             break  # no HTTP/1 here
         finally:
             asked.close()
-        if text == FIGURES:
-            yield "Prometheus's figures"
+        if text.startswith(FIGURES):
+            yield f"figures: {text.removeprefix(FIGURES).decode()}"
         elif answer.status not in REFUSED:
             yield f"{method} {path}: {answer.status}"
     else:

@@ -102,7 +102,8 @@ def test_a_cluster_takes_jobs_with_its_token_and_leaves_nothing_behind(started, 
     record = json.loads((folder / "cluster.json").read_text())
     found = doors(folder, Path(record["temporary"]), *(process["pid"] for process in record["processes"]))
     if found is not None:
-        assert found.doors == ["GET /: 200", "Prometheus's figures"]  # the dashboard's empty page, Ray's metrics
+        assert found.doors[0] == "GET /: 200"  # the dashboard's page, which is empty without a token
+        assert all(door.startswith("figures: ") for door in found.doors[1:])
         assert min(found.ports, found.sockets) > 5
         assert found.paths > 50
 
