@@ -14,7 +14,7 @@ from dmil_core.demonstrations import Demonstration, DemonstrationError, digest
 from services.demonstrations.hdf5 import PlainFile, open_plain
 from services.demonstrations.npz import read_npz
 from services.demonstrations.store import TaskDemonstrations, data_root
-from services.storage.files import inside, named, read_file
+from services.storage.files import ForeignFileError, inside, named, read_file
 from services.suites.base import TaskSuite
 
 FORMS = ("minari", "hdf5", "npz")
@@ -80,7 +80,7 @@ def read_episodes(place: str) -> list[ExternalEpisode]:
         return [ExternalEpisode(one.observations, one.actions, None, None) for one in read_npz(Path(path), "recorded")]
     try:
         return _read_minari(path) if form == "minari" else _read_hdf5(Path(path))
-    except DemonstrationError as error:
+    except (DemonstrationError, ForeignFileError) as error:
         raise DemonstrationError(f"{place}: {error}") from error
     # What h5py raises of files that are not what they look like.
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:

@@ -3,6 +3,7 @@
 ``MINARI_DATASETS_PATH=data minari list local`` shows what is there.
 """
 
+import errno
 import hashlib
 import json
 import logging
@@ -105,7 +106,12 @@ class DemoStore:
                 for index, (observations, actions) in enumerate(_read_episodes(path, metadata.total_episodes))
             )
         except ForeignFileError as error:
-            raise self._damaged(error.filename, str(error.strerror)) from error
+            if error.errno != errno.ELOOP:
+                raise self._damaged(error.filename, str(error.strerror)) from error
+            raise DemonstrationError(
+                f"{error.filename}: got {error.strerror}; wanted a folder of {self.root} itself, which alone may be a "
+                f"link; put what is meant in its place, or set {DATA} to where all data sets are"
+            ) from error
         except ValidationError as error:
             raise self._damaged(path / METADATA, describe_errors(error, "metadata", "; ")) from error
         except DemonstrationError as error:

@@ -66,7 +66,7 @@ class CheckpointWriter:
         if self._path is not None and self.manifest.iteration == state.iteration:
             return self._path
         is_last = state.iteration == self.manifest.config.training.iterations
-        self.manifest = self.manifest.model_copy(
+        manifest = self.manifest.model_copy(
             update={
                 "iteration": state.iteration,
                 "loss": float(np.mean(self._losses)) if self._losses else None,
@@ -74,7 +74,8 @@ class CheckpointWriter:
                 "mlflow_run_id": self._tracker.wait_for_run_id(timeout=RUN_ID_SECONDS if is_last else 0.0),
             }
         )
-        self._path = self._checkpoints.save(state, self._constants, self.manifest, self._needed())
+        self._path = self._checkpoints.save(state, self._constants, manifest, self._needed())
+        self.manifest = manifest  # not before: a stop amid saving saves once more
         self._losses.clear()
         self._meter.record(CHECKPOINT_TIME, time.time())
         logger.info(f"checkpoint: {self._path}")

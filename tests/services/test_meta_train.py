@@ -16,6 +16,7 @@ from mlflow import MlflowClient
 from dmil_core.errors import UserError
 from services import meta_train
 from services.evaluation.results import EpisodeResult
+from services.storage import files
 from services.storage.checkpoints import Checkpoint, Checkpoints
 from services.tracking.models import models_of
 from services.tracking.spool import read_spool
@@ -271,6 +272,21 @@ def test_a_run_has_one_process_at_a_time_and_goes_on_when_that_is_killed(
     measured = [line.value for line in read_spool(folder / "tracking.jsonl") if line.kind == "metrics"]
     steps = [metrics.step for metrics in measured if "gradient_norm" in metrics.values]
     assert steps == sorted(set(steps)), "none twice"
+
+
+def test_a_stop_amid_a_checkpoint_leaves_that_checkpoint(train, workplace: Path, monkeypatch):
+    checkpoints = Checkpoints(workplace / "runs" / "run" / "checkpoints", 3)
+    sync, stops = files.sync, iter([KeyboardInterrupt])
+
+    def stopped_once(path: Path) -> None:
+        for stop in stops if checkpoints.all() else ():
+            raise stop
+        sync(path)
+
+    monkeypatch.setattr(files, "sync", stopped_once)
+    with pytest.raises(KeyboardInterrupt):
+        train("run", "--training.iterations", "8", "--training.checkpoint-every", "2")
+    assert [path.name for path in checkpoints.all()] == ["iteration-0000002", "iteration-0000004"]
 
 
 def test_nothing_is_written_through_links_in_a_run_s_folder(copied_run, train, complaint, workplace: Path):
