@@ -7,7 +7,7 @@ from typing import Any
 import yaml
 
 from dmil_core.errors import UserError, shorten
-from services.storage.files import named, read_file
+from services.storage.files import ForeignFileError, named, read_file
 
 MOST_BYTES = 2**16
 """In a file of settings; PyYAML may need a second for so many."""
@@ -47,6 +47,8 @@ def read_yaml(file: Path, flag: str) -> dict[Any, Any]:
             values = loader.get_single_data()
         finally:
             loader.dispose()
+    except ForeignFileError as error:
+        raise UserError(f"{flag}: {error}") from error
     # Besides its own errors, PyYAML lets through what comes of dates, numbers and tags that are none.
     except (OSError, yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError) as error:
         raise UserError(f"{flag}: got {file}, {_cut(str(error))}; wanted a readable YAML file") from error

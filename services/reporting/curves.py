@@ -172,6 +172,7 @@ def _draw_lines(axis: Axes, curves: Mapping[str, Curve]) -> None:
     values = np.concatenate([np.concatenate([curve.low, curve.mean]) for curve in curves.values()])
     if values.min() > 0 and values.max() > WIDE * values.min():
         axis.set_yscale("log")
+        axis.yaxis.set_major_formatter("{x:g}")
     if len(curves) > 1:
         axis.legend(fontsize="small")
 
