@@ -30,6 +30,7 @@ def test_it_finds_what_the_run_itself_found(programs, trained: Path):
     assert Path("again/report/table.md").read_text() == (trained / "report" / "table.md").read_text()
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("trained")
 def test_settings_of_the_evaluation_may_differ():
     flags = ["--evaluation.shots", "2", "4", "--evaluation.episodes", "2", "--evaluation.fine-tuning-steps", "3"]
@@ -50,6 +51,7 @@ def test_other_tasks_are_meta_testing_tasks(store: DemoStore):
     assert (folder / "SHA256SUMS").is_file(), "its demonstrations are collected for it"
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("trained")
 def test_a_second_evaluation_replaces_the_rows_of_the_first():
     for _ in range(2):

@@ -335,6 +335,7 @@ def test_a_damaged_config_of_a_run_is_named(complaint, copied_run, text: str, wo
     assert len(printed) < 500
 
 
+@pytest.mark.thorough
 def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_it_used(train, capsys):
     undisturbed = train("whole", "--training.iterations", "7")
     newest = train("parts", "--training.iterations", "4", "--training.checkpoint-every", "2").path

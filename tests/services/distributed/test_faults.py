@@ -240,6 +240,7 @@ def test_an_error_is_reported_with_the_command_that_repeats_it(
         reproduce.run([command])
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("joined")
 def test_an_error_in_a_worker_arrives_whole(small: Experiment, data):
     class Failing(Dmil):

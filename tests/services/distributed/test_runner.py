@@ -83,15 +83,15 @@ def test_the_groups_are_part_of_the_result(config, store: DemoStore, data):
     assert np.allclose(*found, atol=1e-3)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("joined")
 @pytest.mark.parametrize(
     ("where", "slots"),
     [
         ("gradient", 5),
-        *(
-            pytest.param(*case, marks=pytest.mark.thorough)
-            for case in (("add", 5), ("between two iterations", 5), ("gradient", 2))
-        ),
+        ("add", 5),
+        ("between two iterations", 5),
+        ("gradient", 2),
     ],
 )
 def test_a_killed_worker_changes_nothing(

@@ -53,6 +53,7 @@ def promote(runs: Mapping[str, Path], tmp_path: Path, capsys: pytest.CaptureFixt
     return promote
 
 
+@pytest.mark.thorough
 def test_the_alias_moves_to_what_is_better_outside_its_interval_only(promote, runs: Mapping[str, Path], complaint):
     arguments = ["--runner", "local", "--promote"]
     message = complaint(evaluate.run, "--checkpoint", str(runs["worse"]), *arguments)

@@ -109,6 +109,7 @@ def test_all_panels_show_the_same_places(trained: Trained):
         assert label in picture.svg
 
 
+@pytest.mark.thorough
 def test_a_picture_of_many_states_stays_small(trained: Trained):
     longer = {"demonstrations": {"per_task": 26, "held_out": 20, "noise": 0.5}}
     group = group_runs({name: trained(name, **longer) for name in "ABCD"})

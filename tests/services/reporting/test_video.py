@@ -11,6 +11,7 @@ from services.reporting.film import FORMS
 from services.suites.rendering import RenderingError
 
 
+@pytest.mark.thorough
 def test_a_film_of_an_episode_beside_what_it_was_adapted_to(finished: FinishedRun, tmp_path: Path, capsys):
     path = tmp_path / "film.gif"
     arguments = ["--task", "door-close", "--shots", "2", "--episode", "1", "--demonstration"]

@@ -32,6 +32,7 @@ Delivery(Path(sys.argv[1]), sys.argv[2]).deliver()
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("no_mlflow")
 def test_what_mlflow_took_before_a_kill_kept_us_from_noting_it_is_there_once(tmp_path: Path, mlflow_file: str):
     (tmp_path / "table.md").write_text("a table")

@@ -117,6 +117,7 @@ def test_a_slow_server_is_not_waited_for(
     assert steps(mlflow_file, Identity.of(tmp_path).run_id, "loss") == list(range(1, 101))
 
 
+@pytest.mark.thorough
 def test_a_killed_run_that_goes_on_has_every_iteration_once(
     programs, train, wait_for, workplace: Path, mlflow_file: str
 ):
