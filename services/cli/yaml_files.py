@@ -48,7 +48,7 @@ def read_yaml(file: Path, flag: str) -> dict[Any, Any]:
         finally:
             loader.dispose()
     except ForeignFileError as error:
-        raise UserError(f"{flag}: {error}") from error
+        raise UserError(f"{flag}: got {file}, {error.strerror}; wanted a readable YAML file") from error
     # Besides its own errors, PyYAML lets through what comes of dates, numbers and tags that are none.
     except (OSError, yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError) as error:
         raise UserError(f"{flag}: got {file}, {_cut(str(error))}; wanted a readable YAML file") from error

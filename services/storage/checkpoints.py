@@ -231,7 +231,7 @@ class Checkpoints:
             DiskFullError: for want of space; what was written by then is removed.
         """
         path = self.folder / f"iteration-{state.iteration:07d}"
-        parameters = unflatten(torch.from_numpy(state.parameters), manifest.torch_shapes)
+        parameters = unflatten(torch.tensor(state.parameters), manifest.torch_shapes)
         contents: dict[str, Mapping[str, np.ndarray]] = {
             PARAMETERS: {name: tensor.numpy() for name, tensor in parameters.items()},
             OPTIMISER: {"first_moment": state.first_moment, "second_moment": state.second_moment},
