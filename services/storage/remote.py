@@ -76,7 +76,7 @@ class Storage:
                     file.write(content)
             except FileExistsError:
                 pass
-            except (NotImplementedError, ValueError):  # no such mode
+            except (NotImplementedError, ValueError):  # how libraries of fsspec say that they have no mode xb
                 self.put(name, content)
         return self.get(name, most) or b""
 

@@ -13,14 +13,11 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
-from axe_playwright_python.sync_playwright import Axe
 from mlflow import MlflowClient
-from playwright.sync_api import Browser, Page, sync_playwright
 
 from dmil_core.configs import PRESETS, ExperimentConfig
 from services import meta_train
@@ -31,9 +28,9 @@ from services.distributed.ray_runner import open_runner
 from services.experiments.experiment import Experiment
 from services.experiments.finished_run import FinishedRun
 from services.storage.checkpoints import Checkpoint, Checkpoints
+from tests.services.pages import browser, open_page  # noqa: F401  fixtures
 
 PROJECT = Path(__file__).parents[2]
-CHROMIUM = shutil.which("chromium")
 QUICK_EVALUATION = ("--evaluation.shots", "1", "--evaluation.episodes", "1", "--evaluation.fine-tuning-steps", "1")
 
 
@@ -276,17 +273,6 @@ def mlflow_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     server.stop()
 
 
-@pytest.fixture(scope="session")
-def browser() -> Iterator[Browser]:
-    if CHROMIUM is None:
-        pytest.fail("no chromium here; wanted it for the tests of pages: apt-get install chromium")
-    with sync_playwright() as playwright:
-        # Its sandbox does not work for root, and the pages are our own.
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
-
-
 class Programs:
     """Starts programs as a user does, in the test's working directory and environment."""
 
@@ -361,61 +347,3 @@ def finished(shared_run: Callable[..., Path]) -> FinishedRun:
     return FinishedRun(
         shared_run("tiny", *schedule, "--evaluation.shots", "1", "2", "--evaluation.fine-tuning-steps", "1")
     )
-
-
-@dataclass
-class Opened:
-    """A page in a browser, and all that it asked for or complained of."""
-
-    page: Page
-    requests: list[str] = field(default_factory=list)
-    complaints: list[str] = field(default_factory=list)
-
-    def faults(self) -> list[str]:
-        """Return the serious and critical findings of axe."""
-        found: list[dict[str, Any]] = Axe().run(self.page).response["violations"]
-        return [
-            f"{fault['id']}: {node['html'][:200]}"
-            for fault in found
-            if fault["impact"] in {"serious", "critical"}
-            for node in fault["nodes"]
-        ]
-
-    def sorted_by(self, caption: str, column: str) -> list[str]:
-        """Click a column's head in a table, and return what stands in the column then."""
-        table = self.page.get_by_role("table", name=caption)
-        table.get_by_role("button", name=column, exact=True).click()
-        names = table.locator("thead th").all_inner_texts()
-        place = next(i for i, name in enumerate(names, start=1) if name == column)
-        return table.locator(f"tbody tr > :nth-child({place})").all_inner_texts()
-
-    def pictures(self) -> list[tuple[str, float, float]]:
-        """Return the text alternative and the size in pixels of every picture and video."""
-        found = []
-        for element in self.page.locator("main svg[role=img], main img, main video").all():
-            box = element.bounding_box()
-            description = element.evaluate(
-                "e => e.alt || e.ariaLabel || [...e.querySelectorAll(':scope > title, :scope > desc')]"
-                ".map(x => x.textContent).join(': ')"
-            )
-            found.append((description, box["width"] if box else 0.0, box["height"] if box else 0.0))
-        return found
-
-
-@pytest.fixture
-def open_page(browser: Browser):
-    """Open a file in the browser; at the end of the test it must have asked for nothing but itself."""
-    context = browser.new_context(viewport={"width": 1200, "height": 900})
-
-    def open_page(path: Path) -> Opened:
-        page = context.new_page()
-        opened = Opened(page)
-        page.on("request", lambda request: opened.requests.append(request.url))
-        page.on("console", lambda message: opened.complaints.append(message.text))
-        page.on("pageerror", lambda error: opened.complaints.append(str(error)))
-        page.goto(path.absolute().as_uri())
-        opened.requests = [url for url in opened.requests if not url.startswith(("data:", path.absolute().as_uri()))]
-        return opened
-
-    yield open_page
-    context.close()
