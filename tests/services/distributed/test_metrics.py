@@ -4,18 +4,19 @@ import re
 import subprocess
 import sys
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
 
 import pytest
 
-from services.distributed.metrics import MEASURES, Meter
+from services.distributed.metrics import MEASURES, NOTHING, Meter
 from services.distributed.runner import LocalRunner
 
 PROJECT = Path(__file__).parents[3]
 LINE = re.compile(r"(ray_dmil_\w+)\{(.*)\} (\S+)")
 
-Series = dict[tuple[str, frozenset[tuple[str, str]]], float]
+SeriesKey = tuple[str, frozenset[tuple[str, str]]]
+Series = dict[SeriesKey, float]
 
 
 def scraped(port: int) -> Series:
@@ -31,7 +32,7 @@ def scraped(port: int) -> Series:
     return found
 
 
-def key(name: str, **labels: str) -> tuple[str, frozenset[tuple[str, str]]]:
+def key(name: str, **labels: str) -> SeriesKey:
     return f"ray_{name}", frozenset({"suite": "ml10-part", **labels}.items())
 
 
@@ -87,30 +88,40 @@ def port(joined, workplace: Path, wait_for) -> Iterator[int]:
 
 @pytest.mark.thorough
 def test_a_run_with_a_killed_worker_arrives(port: int, workplace: Path, wait_for):
+    adaptation, simulation = {"kind": "adaptation"}, {"kind": "simulation"}
+    wanted: dict[SeriesKey, Container[float]] = {
+        key("dmil_iterations_total"): {6},
+        key("dmil_iteration_seconds_count"): {6},
+        key("dmil_slots_redone_total"): range(1, 6),
+        key("dmil_workers_lost_total", **adaptation): {1},
+        key("dmil_workers_lost_total", **simulation): {NOTHING},
+        key("dmil_workers_joined_total", **adaptation): {2, 3},  # the other one may come too late
+        key("dmil_workers", **adaptation): {0},
+        key("dmil_workers", **simulation): {0},
+    }
+    phases = [key("dmil_phase_seconds_total", phase=phase) for phase in ("broadcast", "compute", "step")]
+    checkpoint, waiting = key("dmil_checkpoint_timestamp_seconds"), key("dmil_spool_records")
+    rates = []
+    for split, episodes in (("meta-training", 3), ("meta-testing", 1)):
+        labels = {"split": split, "shots": "1"}
+        wanted[key("dmil_episodes_total", **labels)] = {episodes}
+        rates.append((key("dmil_successes_total", **labels), key("dmil_success_rate", **labels), episodes))
+    present = {*phases, checkpoint, waiting, *(series for *both, _ in rates for series in both)}
     found: Series = {}
 
     def arrived() -> bool:
+        """Each series has its own time, and comes first with what was counted until then."""
+        found.clear()
         found.update(scraped(port))
-        return key("dmil_success_rate", split="meta-testing", shots="1") in found
+        return present <= found.keys() and all(found.get(series) in values for series, values in wanted.items())
 
-    wait_for(arrived, "the metrics")
-    assert found[key("dmil_iterations_total")] == 6
-    assert found[key("dmil_iteration_seconds_count")] == 6
-    phases = [found[key("dmil_phase_seconds_total", phase=phase)] for phase in ("broadcast", "compute", "step")]
-    assert all(seconds > 0 for seconds in phases)
-    assert found[key("dmil_slots_redone_total")] in range(1, 6)
-    assert found[key("dmil_workers_lost_total", kind="adaptation")] == 1
-    assert found[key("dmil_workers_joined_total", kind="adaptation")] in (2, 3), "the other one may come too late"
-    assert found[key("dmil_workers_lost_total", kind="simulation")] < 1e-200
-    assert found[key("dmil_workers", kind="adaptation")] == found[key("dmil_workers", kind="simulation")] == 0
-    for split, episodes in (("meta-training", 3), ("meta-testing", 1)):
-        labels = {"split": split, "shots": "1"}
-        assert found[key("dmil_episodes_total", **labels)] == episodes
-        successes = round(found[key("dmil_successes_total", **labels)])
-        assert found[key("dmil_success_rate", **labels)] == successes / episodes
+    wait_for(arrived, f"{wanted}")
+    assert all(found[phase] > 0 for phase in phases)
+    for successes, rate, episodes in rates:
+        assert found[rate] == round(found[successes]) / episodes
     written = (workplace / "runs/run/checkpoints/iteration-0000006/manifest.json").stat().st_mtime
-    assert found[key("dmil_checkpoint_timestamp_seconds")] == pytest.approx(written, abs=600)
-    assert found[key("dmil_spool_records")] >= 0
+    assert found[checkpoint] == pytest.approx(written, abs=600)
+    assert found[waiting] >= 0
     names = {name for name, _ in found}
     assert all(any(name.startswith(f"ray_{measure.name}") for name in names) for measure in MEASURES)
 
