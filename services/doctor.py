@@ -15,12 +15,12 @@ from uuid import uuid4
 from rich.table import Table
 
 from dmil_core.errors import RunError
+from dmil_core.files import DiskFullError, read_file, remove_file, write_file
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.demonstrations.store import data_root
 from services.distributed.cluster import joined, named_address
 from services.distributed.node_info import NodeFacts, cluster_facts, facts
-from services.storage.files import DiskFullError, read_file, remove_file, write_file
 from services.storage.redaction import error_line, redacted
 from services.tracking.client import connect
 from services.tracking.links import tracking_uri

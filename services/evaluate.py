@@ -3,6 +3,7 @@
 Settings that are not given are those of the run that made the checkpoint.
 """
 
+import logging
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import tyro
 
+from dmil_core.checkpoint import Checkpoint, opened
 from dmil_core.configs import EvaluationConfig
 from dmil_core.errors import UserError
 from services.cli.arguments import Quiet, exit_code, parse, peek
@@ -22,8 +24,9 @@ from services.evaluation.summary import summarise
 from services.experiments.champions import ALIAS, open_promotion
 from services.experiments.experiment import Experiment
 from services.reporting.end_of_run import show, write_report
-from services.storage.checkpoints import Checkpoint, Checkpoints
 from services.storage.folder_lock import held
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ class Arguments:
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     path: Path | None = peek(arguments, checkpoint=Path).checkpoint
-    checkpoint = None if path is None else _opened(path)
+    checkpoint = None if path is None else opened(path, logger.warning)
     evaluation = EvaluationConfig() if checkpoint is None else checkpoint.manifest.config.evaluation
     args = parse(Arguments, __doc__ or "", arguments, Arguments(path or tyro.MISSING, evaluation))
     assert checkpoint is not None, "without --checkpoint there is nothing that parses"
@@ -83,11 +86,6 @@ def _carry_out(args: Arguments, checkpoint: Checkpoint, experiment: Experiment) 
     if promotion is not None:
         for line in promotion.decide(evaluation, args.output):
             console.print(line, soft_wrap=True)
-
-
-def _opened(path: Path) -> Checkpoint:
-    checkpoints = path / "checkpoints"
-    return Checkpoints(checkpoints, kept=0).newest() if checkpoints.is_dir() else Checkpoint(path)
 
 
 if __name__ == "__main__":

@@ -24,9 +24,9 @@ import tyro
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dmil_core.errors import RunError, UserError, describe_errors
+from dmil_core.files import append_to, read_file, write_file
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
-from services.storage.files import append_to, read_file, write_file
 from services.storage.private import bypass_proxies, make_private_folder
 from services.tracking.server import LOGINS, server_command, server_environment
 

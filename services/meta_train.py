@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 from dmil_core.configs import DEFAULT_METHOD, ExperimentConfig
 from dmil_core.errors import UserError, describe_errors
+from dmil_core.files import inside, read_file, write_file
 from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import DEFAULT_PRESET, EARLY, defaults_from
 from services.cli.places import announce
@@ -27,7 +28,6 @@ from services.experiments.experiment import Experiment, OnNonfinite
 from services.experiments.finished_run import FinishedRun
 from services.reporting.end_of_run import PAGE, REPORT, publish, show, write_report
 from services.storage.checkpoints import Checkpoints
-from services.storage.files import inside, read_file, write_file
 from services.storage.folder_lock import held
 from services.storage.redaction import redacted
 from services.storage.remote import STORAGE

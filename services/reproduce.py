@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from dmil_core.checkpoint import Checkpoint
 from dmil_core.errors import RunError
 from dmil_core.methods.base import MetaLearner
 from dmil_core.outer_loop import group_gradient, tasks_of
@@ -19,7 +20,6 @@ from services.distributed.runner import LocalRunner
 from services.distributed.simulation_worker import SimulationWorker
 from services.distributed.work_items import AdaptationRollouts, ExpertAttempts
 from services.experiments.experiment import Experiment
-from services.storage.checkpoints import Checkpoint
 
 
 @dataclass(frozen=True)

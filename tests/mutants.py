@@ -75,10 +75,12 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
         "suspect = worker.in_flight[0]": "suspect = worker.in_flight[-1]",
         "if suspect.deaths >= MAX_DEATHS": "if suspect.deaths > MAX_DEATHS",
     },
-    ("services/storage/checkpoints.py", "services/storage/test_checkpoints.py"): {
-        'exclude={"loss", "mlflow_run_id"}': 'exclude={"loss"}',
-        " and path != best": "",
+    ("dmil_core/checkpoint.py", "services/storage/test_checkpoints.py"): {
+        'exclude={"loss", "mlflow_run_id", ': 'exclude={"loss", ',
         "for path in reversed(paths)": "for path in paths",
+    },
+    ("services/storage/checkpoints.py", "services/storage/test_checkpoints.py"): {
+        " and path != best": "",
     },
     ("services/storage/remote.py", "services/storage/test_remote.py"): {
         "key=lambda file: file == marker": "key=lambda file: file != marker",

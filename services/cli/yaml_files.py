@@ -7,7 +7,7 @@ from typing import Any
 import yaml
 
 from dmil_core.errors import UserError, shorten
-from services.storage.files import ForeignFileError, named, read_file
+from dmil_core.files import ForeignFileError, named, read_file
 
 MOST_BYTES = 2**16
 """In a file of settings; PyYAML may need a second for so many."""

@@ -11,10 +11,10 @@ from minari.storage import get_dataset_path
 from pydantic import BaseModel, Field
 
 from dmil_core.demonstrations import Demonstration, DemonstrationError, digest
+from dmil_core.files import ForeignFileError, inside, named, read_file
 from services.demonstrations.hdf5 import PlainFile, open_plain
 from services.demonstrations.npz import read_npz
 from services.demonstrations.store import TaskDemonstrations, data_root
-from services.storage.files import ForeignFileError, inside, named, read_file
 from services.suites.base import TaskSuite
 
 FORMS = ("minari", "hdf5", "npz")

@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 
 from dmil_core.demonstrations import DemonstrationError
-from services.storage.files import open_file
+from dmil_core.files import open_file
 
 MAX_ARRAYS = 2**32
 """Bytes of all arrays that are read from one file together."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.errors import shorten
-from services.storage.files import named, read_file
+from dmil_core.files import named, read_file
 
 FORMS = {"observations": ("f", 2), "actions": ("f", 2), "episode_lengths": ("iu", 1), "tasks": ("U", 1)}
 """Of each array, the kinds of numbers and the number of axes."""

@@ -22,12 +22,12 @@ from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 from pydantic import BaseModel, Field, ValidationError
 
+from dmil_core.checksums import MOST_LISTED, check_listing, write_listing
 from dmil_core.configs import DemonstrationConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError, digest
 from dmil_core.errors import describe_errors
+from dmil_core.files import ForeignFileError, inside, making_folder, open_file, read_file, room_for
 from dmil_core.trajectories import Episode
-from services.storage.checksums import MOST_LISTED, check_listing, write_listing
-from services.storage.files import ForeignFileError, inside, making_folder, open_file, read_file, room_for
 from services.storage.redaction import error_line
 from services.storage.remote import Storage, given_storage
 from services.suites.base import TaskSuite

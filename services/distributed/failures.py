@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import RunError, UserError, WorkError
-from services.storage.files import named, read_file, write_file
+from dmil_core.files import named, read_file, write_file
 from services.storage.provenance import library_versions
 
 MOST_BYTES = 10_000_000

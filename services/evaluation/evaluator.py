@@ -8,8 +8,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from dmil_core.checkpoint import Checkpoint
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import Demonstration
+from dmil_core.files import inside
 from dmil_core.settings import sub_skills_of
 from services.cli.live_view import Tally
 from services.demonstrations.store import TaskDemonstrations
@@ -20,8 +22,7 @@ from services.distributed.work_items import AdaptationItem, AdaptationRollouts
 from services.evaluation.results import AdaptationResult, EpisodeResult, ImitationResult, write_rows
 from services.evaluation.summary import Evaluation, rates, sub_skill_shares, summary_rows
 from services.rollouts.adaptations import Adaptation, AdaptationOutcome, ImitationErrors, plan_adaptations
-from services.storage.checkpoints import Checkpoint, Checkpoints, iteration_of
-from services.storage.files import inside
+from services.storage.checkpoints import Checkpoints, iteration_of
 from services.storage.provenance import library_versions
 from services.suites.base import Split, TaskSuite
 from services.tracking.tracker import Tracker

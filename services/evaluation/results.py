@@ -9,7 +9,7 @@ from typing import Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dmil_core.errors import UserError, describe_errors
-from services.storage.files import read_file, write_file
+from dmil_core.files import read_file, write_file
 from services.suites.base import Split
 
 Row = TypeVar("Row", bound=BaseModel)

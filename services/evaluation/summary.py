@@ -10,13 +10,13 @@ import numpy as np
 from pydantic import BaseModel
 from rich.table import Table
 
+from dmil_core.checkpoint import Checkpoint
+from dmil_core.files import write_file
 from dmil_core.settings import MethodConfig
 from dmil_core.statistics import interval_text, mean_score, share_entropy, success_rate
 from services.cli.escapes import for_markdown
 from services.evaluation.paper_results import Published, figure_of
 from services.evaluation.results import AdaptationResult, EpisodeResult
-from services.storage.checkpoints import Checkpoint
-from services.storage.files import write_file
 from services.suites.base import Split
 
 BEST = 5

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dmil_core.checkpoint import Checkpoint
 from dmil_core.errors import RunError, UserError
 from services.demonstrations.store import TaskDemonstrations
 from services.distributed.runner import Runner
 from services.evaluation.comparison import Comparison, Difference, SeedEvaluation, Unpaired
 from services.evaluation.summary import Evaluation
 from services.experiments.experiment import Experiment
-from services.storage.checkpoints import Checkpoint
 from services.storage.redaction import error_line, redacted
 from services.suites.registry import open_suite
 from services.tracking.client import connect

@@ -4,6 +4,9 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
+from dmil_core.checkpoint import Checkpoint, CheckpointError, Manifest, Range
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import UserError
@@ -23,9 +26,9 @@ from services.evaluation.evaluator import Evaluations, Evaluator, Tallies, write
 from services.evaluation.summary import Evaluation
 from services.experiments.meta_training import CheckpointWriter, IterationLog, meta_train
 from services.rollouts.adaptations import AdaptationOutcome
-from services.storage.checkpoints import Checkpoint, CheckpointError, Checkpoints, Manifest
+from services.storage.checkpoints import Checkpoints
 from services.storage.provenance import library_versions
-from services.suites.base import Split, TaskSuite
+from services.suites.base import Split, TaskSuite, action_space_of
 from services.suites.registry import open_suite
 from services.tracking.tracker import Tracker
 
@@ -128,10 +131,10 @@ class Experiment:
         )
         if resume is None:
             initial = self.initial_parameters(method)
-            state, manifest = OuterState.start(flatten(initial).numpy()), self._manifest(initial, data)
+            state, manifest = OuterState.start(flatten(initial).numpy()), self._manifest(initial, data, sets)
         else:
             _same_data(resume, data, self.store)
-            changed = {"config": self.config, "versions": library_versions()}
+            changed = {"config": self.config, "versions": library_versions(), **self._ranges(sets)}
             state, manifest = resume.state, resume.manifest.model_copy(update=changed)
         writer = CheckpointWriter(checkpoints, manifest, method.constants(), runner, tracker, evaluations.pending)
         evaluations.catch_up()
@@ -145,7 +148,12 @@ class Experiment:
         log = IterationLog(runner, tracker, evaluations)
         return Checkpoint(meta_train(runner, plan, writer, log, evaluations))
 
-    def _manifest(self, initial: Parameters, data: Mapping[str, TaskDemonstrations]) -> Manifest:
+    def _manifest(
+        self,
+        initial: Parameters,
+        data: Mapping[str, TaskDemonstrations],
+        training_sets: Mapping[str, Sequence[Demonstration]],
+    ) -> Manifest:
         """Return the manifest of the state before the first iteration."""
         return Manifest(
             iteration=0,
@@ -155,7 +163,15 @@ class Experiment:
             data=_digests(data),
             versions=library_versions(),
             mlflow_run_id=None,
+            **self._ranges(training_sets),
         )
+
+    def _ranges(self, training_sets: Mapping[str, Sequence[Demonstration]]) -> dict[str, Range]:
+        """Return what whoever acts later is to know of actions and observations."""
+        space = action_space_of(self.suite)
+        ends = [(d.observations.min(0), d.observations.max(0)) for task in training_sets.values() for d in task]
+        low, high = (np.array(values) for values in zip(*ends, strict=True))
+        return {"actions": Range.of(space.low, space.high), "observed": Range.of(low.min(0), high.max(0))}
 
     # Evaluation
 

@@ -4,15 +4,16 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from dmil_core.checkpoint import Checkpoint
 from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import UserError
+from dmil_core.files import inside, read_json
 from services.demonstrations.store import TaskDemonstrations, open_store
 from services.distributed.runner import LocalRunner
 from services.evaluation.results import EpisodeResult, EvaluationFolder, read_rows
 from services.evaluation.summary import Summary
 from services.experiments.experiment import Experiment
-from services.storage.checkpoints import Checkpoint, Checkpoints
-from services.storage.files import inside, read_json
+from services.storage.checkpoints import Checkpoints
 from services.storage.run_folders import find_folder
 from services.tracking.history import Origin, read_metrics, read_origin
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dmil_core.checkpoint import Checkpoint, Manifest
 from dmil_core.errors import RunError
 from dmil_core.outer_loop import OuterState
 from services.cli.live_view import Status
@@ -19,7 +20,7 @@ from services.distributed.runner import Plan, Runner
 from services.evaluation.evaluator import Evaluations
 from services.evaluation.summary import AGAINST_COLLAPSE, COLLAPSED
 from services.experiments.iteration_metrics import iteration_metrics, nonfinite_message, shares_of, status_of
-from services.storage.checkpoints import Checkpoint, Checkpoints, Manifest
+from services.storage.checkpoints import Checkpoints
 from services.tracking.tracker import Tracker
 
 logger = logging.getLogger(__name__)

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict
 from dmil_core.configs import EvaluationConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.errors import UserError
+from dmil_core.files import inside, read_json, remove_file, write_file
 from dmil_core.statistics import Mean, interval_text, success_rate
 from services.cli.composition import with_evaluation
 from services.cli.progress import Bar, console
@@ -30,7 +31,6 @@ from services.reporting.drawing import (
 )
 from services.reporting.page import DataTable, Part, Prose, Section
 from services.reporting.run_group import MOST_TASKS, policy_after
-from services.storage.files import inside, read_json, remove_file, write_file
 
 FOLDER, PLAN, IMITATION = "adaptation", "plan.json", "imitation.jsonl"
 SHOTS = (1, 3, 5, 10)

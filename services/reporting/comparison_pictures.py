@@ -12,11 +12,11 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from dmil_core.files import write_file
 from dmil_core.seeding import named_rng
 from dmil_core.statistics import interquartile_mean, performance_profile, profile_band
 from services.evaluation.comparison import DIGITS, Cell, Comparison
 from services.reporting.drawing import DASHES, Picture, colour_of, ink_on, marker_of, panels, to_picture
-from services.storage.files import write_file
 
 APART = 0.17
 """Between two numbers of shots, in rows."""

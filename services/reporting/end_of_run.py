@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from dmil_core.checkpoint import Checkpoint
+from dmil_core.files import write_file
 from services.cli.progress import console
 from services.evaluation.summary import AGAINST_COLLAPSE, Summary, rates, table, table_markdown, write_summary
-from services.storage.checkpoints import Checkpoint
-from services.storage.files import write_file
 from services.tracking.tracker import Tracker
 
 REPORT, PAGE = "report", "report.html"

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from dmil_core.files import inside
 from services.evaluation.results import EpisodeResult
 from services.experiments.finished_run import FinishedRun
 from services.experiments.replay import Replay, ReplayedEpisode, ReplayError, replaying
@@ -16,7 +17,6 @@ from services.reporting.end_of_run import REPORT
 from services.reporting.film import FORMS, video_settings, write_film
 from services.reporting.page import Clip, Commands, DataTable, Part, Prose, Section
 from services.reporting.video import camera_of, command, name_of, side_of
-from services.storage.files import inside
 from services.suites.base import Measure, measure_of
 
 MOST_TASKS = 3

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
+from dmil_core.files import write_file
 from services.reporting.drawing import colour_of
 from services.rollouts.recording import Frame, VideoSettings
-from services.storage.files import write_file
 from services.suites.rendering import View
 
 FormName = Literal["mp4", "gif"]

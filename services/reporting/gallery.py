@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 
 from dmil_core.configs import DemonstrationConfig, SuiteConfig
 from dmil_core.errors import UserError
+from dmil_core.files import write_file
 from services.cli.arguments import parse
 from services.cli.places import announce
 from services.cli.progress import Bar, console
 from services.rollouts.episodes import demonstrate
-from services.storage.files import write_file
 from services.suites.base import TaskSuite
 from services.suites.registry import open_suite
 from services.suites.rendering import View, picture

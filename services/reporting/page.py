@@ -7,8 +7,8 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from dmil_core.files import read_file, write_file
 from services.reporting.drawing import Picture
-from services.storage.files import read_file, write_file
 
 MOST_BYTES = 2**28
 """Of a film."""

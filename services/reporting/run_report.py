@@ -10,6 +10,7 @@ from pathlib import Path
 import tyro
 
 from dmil_core.errors import UserError
+from dmil_core.files import inside
 from services.cli.arguments import parse
 from services.cli.places import announce
 from services.cli.progress import Bar, console
@@ -26,7 +27,6 @@ from services.reporting.rates import rates_of_tasks, table_of_all
 from services.reporting.run_group import group_runs, has_sub_skills
 from services.reporting.settings import settings_of_run
 from services.reporting.sub_skills import sub_skill_sections
-from services.storage.files import inside
 
 Writing = Callable[[FinishedRun], Sequence[Section]]
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from dmil_core.checksums import sha256
 from dmil_core.statistics import interval_text
 from services.evaluation.comparison import DIGITS, Cell, CellKey, Comparison, Difference, SeedEvaluation, Unpaired
 from services.evaluation.summary import without_empty_columns
@@ -14,7 +15,6 @@ from services.reporting.bands import curves
 from services.reporting.comparison_pictures import Runs, heat_map, means, profiles
 from services.reporting.drawing import Picture
 from services.reporting.page import Commands, DataTable, Part, Prose, Section, write_page
-from services.storage.checksums import sha256
 from services.suites.base import Split
 
 

@@ -1,177 +1,35 @@
-"""Checkpoints: safetensors and a JSON manifest with a digest of every file, whole or not there at all."""
+"""The checkpoints of a run: written whole or not at all, the newest and the best of them kept."""
 
 import json
 import logging
 import math
-import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Annotated, Any
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
-from safetensors import SafetensorError
-from safetensors.numpy import load, save
+from safetensors.numpy import save
 
-from dmil_core.configs import ExperimentConfig
-from dmil_core.errors import UserError, describe_errors, shorten
-from dmil_core.methods.base import Method
-from dmil_core.methods.registry import method_type
-from dmil_core.networks import Parameters, flatten, unflatten
-from dmil_core.outer_loop import OuterState
-from services.storage.checksums import checked_file, listing, sha256
-from services.storage.files import (
-    create_file,
-    inside,
-    making_folder,
-    read_file,
-    remove_abandoned,
-    remove_folder,
-    room_for,
+from dmil_core.checkpoint import (
+    CONSTANTS,
+    MANIFEST,
+    MARKER,
+    OPTIMISER,
+    PARAMETERS,
+    Checkpoint,
+    CheckpointError,
+    Manifest,
+    checkpoints_in,
+    inside_run,
+    newest,
+    read_manifest,
 )
+from dmil_core.checksums import listing, sha256
+from dmil_core.files import create_file, making_folder, remove_abandoned, remove_folder, room_for
+from dmil_core.networks import unflatten
+from dmil_core.outer_loop import OuterState
 
 logger = logging.getLogger(__name__)
-
-NAMED = r"iteration-\d{7,}"
-"""Folders of checkpoints."""
-MANIFEST, MARKER = "manifest.json", "manifest.sha256"
-PARAMETERS, OPTIMISER, CONSTANTS = "parameters.safetensors", "optimiser.safetensors", "constants.safetensors"
-MOST_MANIFEST = 2**22
-"""Bytes of a manifest."""
-MOST_MARKER = 200
-MOST_TENSORS = 2**32
-"""Bytes of all parameters together: a hundred times those of the paper's networks."""
-MOST_CONSTANTS = 2**26
-"""Bytes of what a method learned once."""
-MOST_HEADER = 2**20
-"""Bytes of a file of tensors besides the tensors."""
-FILES = {
-    PARAMETERS: MOST_TENSORS + MOST_HEADER,
-    OPTIMISER: 2 * MOST_TENSORS + MOST_HEADER,
-    CONSTANTS: MOST_CONSTANTS,
-    MANIFEST: MOST_MANIFEST,
-}
-"""What a checkpoint has besides its marker, and the most bytes of each."""
-
-Side = Annotated[int, Field(ge=1, le=MOST_TENSORS)]
-Shape = Annotated[tuple[Side, ...], Field(min_length=1, max_length=8)]
-
-
-class CheckpointError(UserError):
-    """A checkpoint that is missing or damaged."""
-
-
-class Manifest(BaseModel):
-    """What a checkpoint says of itself, ``manifest.json``."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    iteration: Annotated[int, Field(ge=0, lt=2**63)]
-    """Outer steps done; the one unit of progress everywhere."""
-    loss: float | None
-    """Mean loss after adaptation since the checkpoint before, by which the best is chosen."""
-    config: ExperimentConfig
-    shapes: dict[str, Shape]
-    """Names and shapes of the parameters, in the order in which they are laid out flat; none of a method that learns
-    nothing."""
-    environment_steps: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Steps that an online method took in the environments of meta-training tasks."""
-    data: dict[str, str]
-    """The SHA-256 of each task's demonstrations."""
-    versions: dict[str, str]
-    mlflow_run_id: str | None
-    files: dict[str, str] = {}
-    """The SHA-256 of every file of tensors."""
-
-    @field_validator("shapes")
-    @classmethod
-    def _can_be_held(cls, shapes: dict[str, Shape]) -> dict[str, Shape]:
-        if odd := [name for name, shape in shapes.items() if name.endswith(".weight") and len(shape) < 2]:
-            raise ValueError(f"shapes: got {shapes[odd[0]]} for {shorten(odd[0])}; wanted a matrix")
-        if (total := 4 * sum(map(math.prod, shapes.values()))) > MOST_TENSORS:
-            raise ValueError(f"shapes: got {total} bytes of parameters; wanted at most {MOST_TENSORS}")
-        return shapes
-
-    @property
-    def size(self) -> int:
-        """The number of all parameters together."""
-        return sum(map(math.prod, self.shapes.values()))
-
-    @property
-    def torch_shapes(self) -> dict[str, torch.Size]:
-        """The same as `shapes`, as torch has them."""
-        return {name: torch.Size(shape) for name, shape in self.shapes.items()}
-
-    @property
-    def digest(self) -> str:
-        """What a result row names the checkpoint by.
-
-        The SHA-256 of the manifest as canonical JSON, and so of all tensors, settings and data, but without `loss` and
-        `mlflow_run_id`: they differ between a run that was disturbed and one that was not, which end alike otherwise.
-        """
-        identity = self.model_dump(mode="json", exclude={"loss", "mlflow_run_id"})
-        identity["shapes"] = list(identity["shapes"].items())  # their order is the parameters' order
-        return sha256(json.dumps(identity, sort_keys=True, separators=(",", ":")).encode())
-
-
-class Checkpoint:
-    """One checkpoint, read and found whole."""
-
-    def __init__(self, path: Path) -> None:
-        """Read a checkpoint's folder.
-
-        Raises:
-            CheckpointError: names the file that is missing, not as its digest says or not as the manifest describes.
-        """
-        self.path = path
-        self.manifest = _read_manifest(path)
-        self.digest = self.manifest.digest
-        """What result rows name the checkpoint by."""
-        self.parameters: Mapping[str, np.ndarray] = self._read(PARAMETERS, self.manifest.shapes)
-        """The parameters by name, in their flat order."""
-        flat = (self.manifest.size,)
-        self._moments = self._read(OPTIMISER, {"first_moment": flat, "second_moment": flat})
-        self.constants: Mapping[str, np.ndarray] = self._read(CONSTANTS, None)
-        """What the method learned once from the data."""
-
-    def _read(self, name: str, shapes: Mapping[str, Sequence[int]] | None) -> dict[str, np.ndarray]:
-        """Return the tensors of a file, which have these names and shapes, in this order."""
-        most = MOST_CONSTANTS if shapes is None else 4 * sum(map(math.prod, shapes.values())) + MOST_HEADER
-        try:
-            tensors = load(checked_file(self.path, name, self.manifest.files.get(name), most))
-        except OSError as error:
-            raise self._damaged(name, _describe(error), "what its digest in the manifest says") from error
-        except (SafetensorError, KeyError, ValueError, TypeError, OverflowError) as error:  # KeyError: an odd dtype
-            raise self._damaged(name, f"{type(error).__name__}, {str(error)[:200]}", "safetensors") from error
-        if odd := [key for key, tensor in tensors.items() if tensor.dtype != np.float32]:
-            raise self._damaged(name, f"{tensors[odd[0]].dtype} in {shorten(odd[0])}", "float32 only")
-        if shapes is None:
-            return tensors
-        found_shapes = {key: tensor.shape for key, tensor in tensors.items()}
-        if found_shapes != {key: tuple(shape) for key, shape in shapes.items()}:
-            raise self._damaged(name, f"tensors {shorten(found_shapes)}", f"the manifest's {shorten(dict(shapes))}")
-        return {key: tensors[key] for key in shapes}
-
-    def _damaged(self, name: str, got: str, wanted: str) -> CheckpointError:
-        return CheckpointError(f"{self.path / name}: got {got}; wanted {wanted}; use another checkpoint")
-
-    @property
-    def state(self) -> OuterState:
-        """The learner's state, a new copy each time."""
-        flat = flatten({name: torch.from_numpy(array) for name, array in self.parameters.items()}).numpy()
-        return OuterState(
-            self.manifest.iteration, flat, **{name: array.copy() for name, array in self._moments.items()}
-        )
-
-    def tensors(self) -> Parameters:
-        """Return the parameters, a new copy each time, laid out as in meta-training: the last bits depend on it."""
-        return unflatten(torch.from_numpy(self.state.parameters), self.manifest.torch_shapes)
-
-    def method(self, action_dim: int) -> Method[Any]:
-        """Return the method that the parameters are of, for actions of so many numbers."""
-        settings = self.manifest.config.method
-        return method_type(settings.name).restored(settings, action_dim, self.constants)
 
 
 def iteration_of(path: Path) -> int:
@@ -189,8 +47,7 @@ class Checkpoints:
 
     def all(self) -> list[Path]:
         """Return the checkpoints' folders, oldest first."""
-        found = (path for path in self.folder.glob("iteration-*") if re.fullmatch(NAMED, path.name))
-        return sorted(path for path in found if path.is_dir())
+        return checkpoints_in(self.folder)
 
     def newest(self) -> Checkpoint:
         """Read the newest checkpoint that is whole, and name damaged ones that are newer in a warning.
@@ -198,25 +55,7 @@ class Checkpoints:
         Raises:
             CheckpointError: if there is none.
         """
-        paths = self.all()
-        complaints: list[str] = []
-        for path in reversed(paths):
-            try:
-                checkpoint = Checkpoint(self._inside(path))
-            except CheckpointError as error:
-                complaints.append(" ".join(str(error).splitlines()))
-            else:
-                if complaints:
-                    logger.warning(f"{' | '.join(complaints)}; taking {path} instead")
-                return checkpoint
-        damaged = f"{len(paths)} checkpoints, none of them whole" if paths else "no checkpoint"
-        raise CheckpointError("\n".join([f"{self.folder}: got {damaged}; wanted one; start the run anew", *complaints]))
-
-    def _inside(self, path: Path) -> Path:
-        try:
-            return inside(self.folder.parent, f"{self.folder.name}/{path.name}")
-        except OSError as error:
-            raise CheckpointError(str(error)) from error
+        return newest(self.folder, logger.warning)
 
     def save(
         self,
@@ -260,7 +99,7 @@ class Checkpoints:
         losses: dict[Path, float | None] = {}
         for path in self.all():
             try:
-                losses[path] = _read_manifest(self._inside(path)).loss
+                losses[path] = read_manifest(inside_run(self.folder, path)).loss
             except CheckpointError:
                 continue
         return losses
@@ -273,30 +112,3 @@ class Checkpoints:
         for path in self.all() if len(whole) > self.kept else []:
             if path < whole[-self.kept] and path != best and path not in needed and not path.is_symlink():
                 remove_folder(self.folder.parent, f"{self.folder.name}/{path.name}")
-
-
-def _read_manifest(path: Path) -> Manifest:
-    """Read the manifest of the checkpoint `path`, and see whether the files it speaks of are there.
-
-    Raises:
-        CheckpointError: if not.
-    """
-    try:
-        text = read_file(path, MANIFEST, MOST_MANIFEST)
-        if read_file(path, MARKER, MOST_MARKER).decode("ascii", "replace") != listing({MANIFEST: sha256(text)}):
-            raise OSError(f"a file whose SHA-256 is not the one in {MARKER}")
-        manifest = Manifest.model_validate_json(text)
-    except (OSError, ValidationError) as error:
-        got = _describe(error) if isinstance(error, OSError) else describe_errors(error, "manifest", "; ")
-        raise CheckpointError(
-            f"{path / MANIFEST}: got {got}; wanted a checkpoint's manifest; use another checkpoint"
-        ) from error
-    for name, least in {PARAMETERS: 4 * manifest.size, OPTIMISER: 8 * manifest.size, CONSTANTS: 1}.items():
-        size = (path / name).stat().st_size if (path / name).is_file() else 0
-        if size < least:
-            raise CheckpointError(f"{path / name}: got {size} bytes; wanted at least {least}; use another checkpoint")
-    return manifest
-
-
-def _describe(error: OSError) -> str:
-    return f"{error.strerror} ({error.filename})" if error.filename else str(error)

@@ -13,7 +13,7 @@ from pathlib import Path
 from pydantic import BaseModel, ValidationError
 
 from dmil_core.errors import UserError
-from services.storage.files import open_descriptor, room_for
+from dmil_core.files import open_descriptor, room_for
 
 logger = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import fsspec
 
 from dmil_core.errors import RunError, UserError
-from services.storage.files import create_file, making_folder
+from dmil_core.files import create_file, making_folder
 from services.storage.redaction import redacted
 
 STORAGE = "DMIL_STORAGE"

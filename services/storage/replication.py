@@ -8,9 +8,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
 
+from dmil_core.checkpoint import FILES, MARKER, MOST_MARKER, NAMED
 from dmil_core.errors import UserError
-from services.storage.checkpoints import FILES, MARKER, MOST_MARKER, NAMED, Checkpoints
-from services.storage.files import read_file, remove_folder, write_file
+from dmil_core.files import read_file, remove_folder, write_file
+from services.storage.checkpoints import Checkpoints
 from services.storage.folder_lock import held
 from services.storage.redaction import error_line
 from services.storage.remote import Storage, given_storage

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from dmil_core.errors import UserError, shorten
-from services.storage.files import ForeignFileError, inside
+from dmil_core.files import ForeignFileError, inside
 
 
 def new_name(name: str, runs: Path) -> Path:

@@ -49,6 +49,7 @@ class TaskSuite(Protocol):
     - ``camera``: what `services.suites.rendering.picture` looks through, if its environments are MuJoCo's;
     - ``measure_of(task)``: a `Measure` of how far an episode has come, or None; of suites with scores it is the score;
     - ``make_measured_env(task)``: as ``make_env``, but its infos hold the measure, where those of ``make_env`` do not;
+    - ``action_space``: the `Box` of its environments' actions, where making one takes long;
     - ``expert_tasks``: the tasks whose experts are verified, where those are not the tasks of both splits.
     """
 
@@ -106,6 +107,17 @@ def build_env(suite: TaskSuite, task: str, *, measured: bool = False) -> Environ
                 f"{'obs_dim' if field == 'observation_space' else 'action_dim'} says; mend either"
             )
     return env
+
+
+def action_space_of(suite: TaskSuite) -> Box:
+    """Return the space of actions in a suite's environments.
+
+    Raises:
+        UserError: as `build_env`.
+    """
+    space = getattr(suite, "action_space", None) or build_env(suite, suite.train_tasks[0]).action_space
+    assert isinstance(space, Box)
+    return space
 
 
 Split = Literal["meta-training", "meta-testing"]

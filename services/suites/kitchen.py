@@ -159,6 +159,7 @@ class KitchenSuite:
     camera = View((-0.2, 0.5, 2.0), distance=2.2, azimuth=70, elevation=-35)
     obs_dim = 30
     action_dim = 9
+    action_space = Box(-1, 1, (9,))
 
     def __init__(self, config: SuiteConfig) -> None:
         """Take a split of `SPLITS`, or some other chains in place of its own.

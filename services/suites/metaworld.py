@@ -5,6 +5,7 @@ from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
+from gymnasium.spaces import Box
 from jaxtyping import Float64
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from metaworld.policies import ENV_POLICY_MAP
@@ -103,6 +104,7 @@ class MetaWorldSuite:
     camera = View((0.0, 0.62, 0.1), distance=1.25, azimuth=145, elevation=-30)
     obs_dim = 39
     action_dim = 4
+    action_space = Box(-1, 1, (4,))
     best_score = 1
 
     def __init__(self, config: SuiteConfig) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import tyro
 
 from dmil_core.errors import UserError
+from dmil_core.files import inside
 from services.cli.arguments import parse
 from services.cli.places import announce
 from services.evaluation.comparison import Comparison
@@ -15,7 +16,6 @@ from services.experiments.finished_run import FinishedRun
 from services.reporting.comparison import compare_runs
 from services.reporting.page import Commands
 from services.reporting.side_by_side import write_comparison
-from services.storage.files import inside
 from services.storage.run_folders import find_folder
 from services.sweeps.folders import MARK, TABLES, SweepFolder
 from services.sweeps.tables import Tables, comparison_of, tables_of

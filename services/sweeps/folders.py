@@ -16,10 +16,10 @@ from typing import Literal, TypeVar
 
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
+from dmil_core.checksums import sha256
 from dmil_core.configs import EvaluationConfig, ExperimentConfig
 from dmil_core.errors import UserError
-from services.storage.checksums import sha256
-from services.storage.files import inside, read_json, write_file
+from dmil_core.files import inside, read_json, write_file
 from services.storage.run_folders import make_folder
 from services.sweeps.settings import PlannedTrial, Preset, Sweep, planned
 

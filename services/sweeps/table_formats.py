@@ -10,6 +10,7 @@ import tyro
 import yaml
 from rich.table import Table
 
+from dmil_core.files import inside, write_file
 from dmil_core.statistics import interval_text
 from services.cli.arguments import parse
 from services.cli.escapes import for_csv, for_latex, for_markdown, one_line
@@ -18,7 +19,6 @@ from services.cli.progress import console
 from services.evaluation.comparison import DIGITS, Cell, Difference, Unpaired
 from services.evaluation.summary import markdown_rows
 from services.reporting.comparison_pictures import draw_means
-from services.storage.files import inside, write_file
 from services.storage.run_folders import find_folder
 from services.sweeps.compare import write_sweep_page
 from services.sweeps.folders import MARK, TABLES, SweepFolder

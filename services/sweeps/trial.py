@@ -12,7 +12,9 @@ import numpy as np
 import torch
 from pydantic import TypeAdapter
 
+from dmil_core.checkpoint import Checkpoint
 from dmil_core.errors import RunError, UserError
+from dmil_core.files import append_to, read_file, write_file
 from services.cli.composition import with_evaluation
 from services.cli.progress import Clock, console_logging
 from services.demonstrations.store import DemoStore
@@ -20,8 +22,7 @@ from services.distributed.ray_runner import RayRunner
 from services.evaluation.results import EpisodeResult, read_rows
 from services.evaluation.summary import rates, summary_rows
 from services.experiments.experiment import Experiment
-from services.storage.checkpoints import Checkpoint, Checkpoints
-from services.storage.files import append_to, read_file, write_file
+from services.storage.checkpoints import Checkpoints
 from services.storage.folder_lock import held
 from services.storage.remote import given_storage
 from services.storage.replication import replicated

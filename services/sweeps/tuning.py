@@ -10,10 +10,10 @@ from ray.tune import Callback, RunConfig, TuneConfig
 from ray.tune.schedulers import AsyncHyperBandScheduler, TrialScheduler
 
 from dmil_core.errors import UserError
+from dmil_core.files import remove_file
 from services.cli.progress import Bar
 from services.demonstrations.store import data_root
 from services.distributed.cluster import cpus
-from services.storage.files import remove_file
 from services.storage.remote import STORAGE
 from services.sweeps.folders import RESULT, SweepFolder, TrialResult
 from services.sweeps.trial import HELD_OUT, ITERATION, run_trial, tracker_of

@@ -15,9 +15,9 @@ import tyro
 from tyro.conf import Positional
 
 from dmil_core.errors import RunError, UserError
+from dmil_core.files import inside
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
-from services.storage.files import inside
 from services.storage.redaction import error_line, redacted
 from services.storage.run_folders import find_folder
 from services.tracking.delivery import Delivery

@@ -11,7 +11,7 @@ from uuid import uuid4
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dmil_core.errors import RunError, UserError
-from services.storage.files import read_file, sync, write_file
+from dmil_core.files import read_file, sync, write_file
 from services.storage.folder_lock import FolderHeldError, held
 from services.tracking.client import connect, set_mlflow_defaults
 from services.tracking.links import artifacts_beside

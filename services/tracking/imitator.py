@@ -14,10 +14,10 @@ import torch
 from mlflow.models import set_model
 from mlflow.pyfunc.model import PythonModel, PythonModelContext
 
+from dmil_core.checkpoint import Checkpoint
 from dmil_core.demonstrations import Demonstration, digest
 from dmil_core.errors import RunError
 from dmil_core.methods.base import FineTuning, Policy
-from services.storage.checkpoints import Checkpoint
 from services.tracking.packing import unpacked
 
 POLICIES_KEPT = 16

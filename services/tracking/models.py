@@ -5,9 +5,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dmil_core.checkpoint import FILES, MARKER, Checkpoint
 from dmil_core.configs import EvaluationConfig
-from services.storage.checkpoints import FILES, MARKER, Checkpoint
-from services.storage.files import copy_plain, inside
+from dmil_core.files import copy_plain, inside
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from dmil_core.errors import UserError
-from services.storage.files import read_file
+from dmil_core.files import read_file
 from services.storage.redaction import redacted
 from services.tracking.links import artifacts_beside
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, TypeVar
 
-from services.storage.checkpoints import Checkpoint, CheckpointError
-from services.storage.files import ForeignFileError, copy_plain, inside
+from dmil_core.checkpoint import Checkpoint, CheckpointError
+from dmil_core.files import ForeignFileError, copy_plain, inside
 from services.tracking.models import log_model
 from services.tracking.spool import Artifact, Line, Measured, Trained
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from dmil_core.errors import UserError
-from services.storage.files import append_to, open_file, room_for
+from dmil_core.files import append_to, open_file, room_for
 
 LONGEST_LINE = 2**22
 NOTE = "mlflow.note.content"

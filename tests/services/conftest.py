@@ -19,6 +19,7 @@ from typing import NamedTuple
 import pytest
 from mlflow import MlflowClient
 
+from dmil_core.checkpoint import Checkpoint
 from dmil_core.configs import PRESETS, ExperimentConfig
 from services import meta_train
 from services.cli.arguments import exit_code
@@ -27,7 +28,7 @@ from services.demonstrations.store import DemoStore, TaskDemonstrations
 from services.distributed.ray_runner import open_runner
 from services.experiments.experiment import Experiment
 from services.experiments.finished_run import FinishedRun
-from services.storage.checkpoints import Checkpoint, Checkpoints
+from services.storage.checkpoints import Checkpoints
 from tests.services.pages import browser, open_page  # noqa: F401  fixtures
 
 PROJECT = Path(__file__).parents[2]

@@ -13,11 +13,12 @@ import psutil
 import pytest
 from mlflow import MlflowClient
 
+from dmil_core import files
+from dmil_core.checkpoint import Checkpoint
 from dmil_core.errors import UserError
 from services import meta_train
 from services.evaluation.results import EpisodeResult
-from services.storage import files
-from services.storage.checkpoints import Checkpoint, Checkpoints
+from services.storage.checkpoints import Checkpoints
 from services.tracking.models import models_of
 from services.tracking.spool import read_spool
 

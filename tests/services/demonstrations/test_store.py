@@ -12,13 +12,13 @@ import minari
 import numpy as np
 import pytest
 
+from dmil_core.checksums import write_listing
 from dmil_core.configs import DemonstrationConfig, ExperimentConfig, SuiteConfig
 from dmil_core.demonstrations import DemonstrationError
 from dmil_core.trajectories import Episode
 from services.demonstrations.store import DemoStore, TaskDemonstrations
 from services.distributed.ray_runner import open_runner
 from services.experiments.experiment import Experiment
-from services.storage.checksums import write_listing
 from services.suites.metaworld import MetaWorldSuite
 from services.suites.registry import open_suite
 

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 
+from dmil_core.checkpoint import Checkpoint
 from dmil_core.methods.base import FineTuning, MetaLearner, OnlineMetaLearner
 from dmil_core.methods.registry import OURS, method_type
 from services import meta_train
 from services.demonstrations.store import DemoStore
 from services.evaluation.results import EpisodeResult, read_rows
-from services.storage.checkpoints import Checkpoint, Checkpoints
+from services.storage.checkpoints import Checkpoints
 from tests.services.conftest import QUICK_EVALUATION
 from tests.services.experiments.same_bits import METHODS, RUNS, processor, train
 

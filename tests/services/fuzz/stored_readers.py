@@ -13,13 +13,14 @@ from misplaced import misplace, restore
 from mutations import Odd, json_bytes, mutated_bytes, mutated_value
 from safetensors.numpy import save
 
+from dmil_core.checkpoint import Checkpoint, Manifest
+from dmil_core.checksums import sha256, write_listing
 from dmil_core.configs import PRESETS
 from dmil_core.demonstrations import digest
 from dmil_core.outer_loop import OuterState
 from dmil_core.trajectories import Episode
 from services.demonstrations.store import DemoStore
-from services.storage.checkpoints import Checkpoint, Checkpoints, Manifest
-from services.storage.checksums import sha256, write_listing
+from services.storage.checkpoints import Checkpoints
 
 
 class CheckpointReader:

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from dmil_core.checkpoint import Checkpoint, Manifest
 from dmil_core.configs import ExperimentConfig
 from dmil_core.outer_loop import OuterState
 from services.evaluation.results import AdaptationResult, EpisodeResult, write_rows
 from services.evaluation.summary import Evaluation, summarise, write_summary
-from services.storage.checkpoints import Checkpoint, Checkpoints, Manifest
+from services.storage.checkpoints import Checkpoints
 
 SPLITS = ("meta-training", "meta-testing")
 TASKS = ("reach", "push", "window-open")

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
+from dmil_core.checkpoint import Checkpoint, CheckpointError, Manifest
 from dmil_core.configs import ExperimentConfig, TrainingConfig
+from dmil_core.files import DiskFullError
 from dmil_core.outer_loop import OuterState, OuterStep, add
-from services.storage.checkpoints import Checkpoint, CheckpointError, Checkpoints, Manifest
-from services.storage.files import DiskFullError
+from services.storage.checkpoints import Checkpoints
 
 SHAPES = {"high.0.weight": (3, 2), "high.0.bias": (3,), "a.comes.first.in.the.file": (4,)}
 TENSORS = ("parameters.safetensors", "optimiser.safetensors", "constants.safetensors")
@@ -309,7 +310,7 @@ def test_what_killed_writers_left_is_removed_and_a_failed_one_leaves_nothing(tmp
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
     with monkeypatch.context() as patch:
-        patch.setattr("services.storage.files.sync", full)
+        patch.setattr("dmil_core.files.sync", full)
         with pytest.raises(DiskFullError, match="iteration-0000001: needs"):
             save(checkpoints, start()._replace(iteration=1))
     assert list(tmp_path.iterdir()) == [whole]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from dmil_core.errors import UserError
-from services.storage.files import ForeignFileError
+from dmil_core.files import ForeignFileError
 from services.storage.folder_lock import LOCK, held
 
 HOLDS = """

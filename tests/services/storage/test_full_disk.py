@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dmil_core.files import DiskFullError
 from dmil_core.trajectories import Episode
 from services import meta_train
 from services.cli.arguments import exit_code
 from services.demonstrations.store import DemoStore
 from services.evaluation.results import EpisodeResult, write_rows
 from services.storage.checkpoints import Checkpoints
-from services.storage.files import DiskFullError
 from tests.services.conftest import QUICK_EVALUATION
 
 

@@ -13,13 +13,14 @@ import fsspec
 import numpy as np
 import pytest
 
+from dmil_core.checkpoint import FILES, MARKER, Checkpoint, CheckpointError
 from dmil_core.configs import PRESETS
 from dmil_core.errors import RunError, UserError
 from services import meta_train
 from services.demonstrations.store import DemoStore, open_store
 from services.distributed.ray_runner import open_runner
 from services.experiments.experiment import Experiment
-from services.storage.checkpoints import FILES, MARKER, Checkpoint, CheckpointError, Checkpoints
+from services.storage.checkpoints import Checkpoints
 from services.storage.remote import STORAGE, Storage
 from services.storage.replication import Replica, replicated
 from tests.services.conftest import QUICK_EVALUATION

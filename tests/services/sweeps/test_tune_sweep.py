@@ -13,12 +13,13 @@ import yaml
 from mlflow import MlflowClient
 from mlflow.entities import Run
 
+from dmil_core.checkpoint import Checkpoint
 from dmil_core.configs import ExperimentConfig
 from services import tune_sweep
 from services.demonstrations.store import TaskDemonstrations, open_store
 from services.distributed.ray_runner import open_runner
 from services.experiments.experiment import Experiment
-from services.storage.checkpoints import Checkpoint, Checkpoints
+from services.storage.checkpoints import Checkpoints
 from services.storage.remote import STORAGE
 from services.sweeps.folders import SweepFolder
 from services.tracking.tracker import Tracker

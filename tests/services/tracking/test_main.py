@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from mlflow import MlflowClient
 
+from dmil_core.checkpoint import Checkpoint
 from dmil_core.errors import RunError, UserError
-from services.storage.checkpoints import Checkpoint
-from services.storage.files import ForeignFileError
+from dmil_core.files import ForeignFileError
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.delivery import Delivery, Identity
 from services.tracking.models import models_of

@@ -13,6 +13,7 @@ from mlflow import MlflowClient
 from mlflow.artifacts import download_artifacts
 from mlflow.pyfunc.model import PythonModelContext
 
+from dmil_core.checkpoint import Checkpoint
 from dmil_core.configs import preset_of
 from dmil_core.errors import RunError, UserError
 from dmil_core.methods.base import FineTuning
@@ -20,7 +21,7 @@ from dmil_core.methods.registry import OURS, method_type
 from services.demonstrations.store import DemoStore
 from services.distributed.runner import LocalRunner
 from services.experiments.experiment import Experiment
-from services.storage.checkpoints import Checkpoint, Checkpoints
+from services.storage.checkpoints import Checkpoints
 from services.tracking import tracker as tracking
 from services.tracking.delivery import Identity
 from services.tracking.imitator import POLICIES_KEPT, Imitator

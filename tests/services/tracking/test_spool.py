@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from dmil_core.errors import UserError
-from services.storage.files import DiskFullError
+from dmil_core.files import DiskFullError
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.delivery import Identity
 from services.tracking.spool import Spool, read_spool

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from mlflow import MlflowClient
 
-from services.storage import files
+from dmil_core import files
+from dmil_core.files import DiskFullError
 from services.storage.checkpoints import Checkpoints
-from services.storage.files import DiskFullError
 from services.tracking import tracker as tracking
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.delivery import Identity

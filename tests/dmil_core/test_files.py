@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from services.storage.files import (
+from dmil_core.files import (
     DiskFullError,
     ForeignFileError,
     append_to,

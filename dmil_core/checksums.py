@@ -5,7 +5,7 @@ import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
-from services.storage.files import open_file, read_file, write_file
+from dmil_core.files import open_file, read_file, write_file
 
 MOST_LISTED = 2**16
 """Bytes of a listing."""
