@@ -7,8 +7,9 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import torch
@@ -49,6 +50,7 @@ FILES = {
 }
 """What a checkpoint has besides its marker, and the most bytes of each."""
 
+Model = TypeVar("Model", bound=BaseModel)
 Side = Annotated[int, Field(ge=1, le=MOST_TENSORS)]
 Shape = Annotated[tuple[Side, ...], Field(min_length=1, max_length=8)]
 
@@ -162,23 +164,16 @@ class Checkpoint:
     def _read(self, name: str, shapes: Mapping[str, Sequence[int]] | None) -> dict[str, np.ndarray]:
         """Return the tensors of a file, which have these names and shapes, in this order."""
         most = MOST_CONSTANTS if shapes is None else 4 * sum(map(math.prod, shapes.values())) + MOST_HEADER
-        try:
-            tensors = load(checked_file(self.path, name, self.manifest.files.get(name), most))
-        except OSError as error:
-            raise self._damaged(name, _describe(error), "what its digest in the manifest says") from error
-        except (SafetensorError, KeyError, ValueError, TypeError, OverflowError) as error:  # KeyError: an odd dtype
-            raise self._damaged(name, f"{type(error).__name__}, {str(error)[:200]}", "safetensors") from error
+        tensors = read_tensors(self.path, name, self.manifest.files.get(name), most)
         if odd := [key for key, tensor in tensors.items() if tensor.dtype != np.float32]:
-            raise self._damaged(name, f"{tensors[odd[0]].dtype} in {shorten(odd[0])}", "float32 only")
+            raise damaged(self.path / name, f"{tensors[odd[0]].dtype} in {shorten(odd[0])}", "float32 only")
         if shapes is None:
             return tensors
         found_shapes = {key: tensor.shape for key, tensor in tensors.items()}
         if found_shapes != {key: tuple(shape) for key, shape in shapes.items()}:
-            raise self._damaged(name, f"tensors {shorten(found_shapes)}", f"the manifest's {shorten(dict(shapes))}")
+            got, wanted = f"tensors {shorten(found_shapes)}", f"the manifest's {shorten(dict(shapes))}"
+            raise damaged(self.path / name, got, wanted)
         return {key: tensors[key] for key in shapes}
-
-    def _damaged(self, name: str, got: str, wanted: str) -> CheckpointError:
-        return CheckpointError(f"{self.path / name}: got {got}; wanted {wanted}; use another checkpoint")
 
     @property
     def state(self) -> OuterState:
@@ -196,6 +191,60 @@ class Checkpoint:
         """Return the method that the parameters are of, for actions of so many numbers."""
         settings = self.manifest.config.method
         return method_type(settings.name).restored(settings, action_dim, self.constants)
+
+    @cached_property
+    def actions(self) -> Range:
+        """The bounds of actions.
+
+        Those of checkpoints of version 0.1 were -1 and 1 in all suites. How many numbers an action had the parameters
+        tell, whose count grows by as much with each.
+
+        Raises:
+            CheckpointError: of such a checkpoint, if its method learns nothing.
+        """
+        if self.manifest.actions is not None:
+            return self.manifest.actions
+        if not self.parameters:
+            raise damaged(self.path / MANIFEST, "no actions", "their bounds, which version 0.1 did not write")
+        rng = np.random.default_rng(0)
+        one, two = (flatten(self.method(count).initial_parameters(rng)).numel() for count in (1, 2))
+        count = 1 + (self.manifest.size - one) // (two - one)
+        return Range.of(np.full(count, -1.0), np.full(count, 1.0))
+
+
+def read_tensors(folder: Path, name: str, digest: str | None, most: int) -> dict[str, np.ndarray]:
+    """Return the tensors of a file of safetensors in `folder`, of at most so many bytes.
+
+    Raises:
+        CheckpointError: if it is missing, has another digest, or cannot be read.
+    """
+    try:
+        return load(checked_file(folder, name, digest, most))
+    except OSError as error:
+        raise damaged(folder / name, _describe(error), "what its digest in the manifest says") from error
+    except (SafetensorError, KeyError, ValueError, TypeError, OverflowError) as error:  # KeyError: an odd dtype
+        raise damaged(folder / name, f"{type(error).__name__}, {str(error)[:200]}", "safetensors") from error
+
+
+def damaged(path: Path, got: str, wanted: str) -> CheckpointError:
+    """Return the error that says what is wrong with a file."""
+    return CheckpointError(f"{path}: got {got}; wanted {wanted}; use another checkpoint")
+
+
+def read_sealed(folder: Path, name: str, marker: str, most: int, model: type[Model]) -> Model:
+    """Read a JSON file whose digest is in a file beside it, the `marker`.
+
+    Raises:
+        CheckpointError: if either is missing or damaged.
+    """
+    try:
+        text = read_file(folder, name, most)
+        if read_file(folder, marker, MOST_MARKER).decode("ascii", "replace") != listing({name: sha256(text)}):
+            raise OSError(f"a file whose SHA-256 is not the one in {marker}")
+        return model.model_validate_json(text)
+    except (OSError, ValidationError) as error:
+        got = _describe(error) if isinstance(error, OSError) else describe_errors(error, "manifest", "; ")
+        raise damaged(folder / name, got, "a checkpoint's manifest") from error
 
 
 def checkpoints_in(folder: Path) -> list[Path]:
@@ -256,16 +305,7 @@ def read_manifest(path: Path) -> Manifest:
     Raises:
         CheckpointError: if not.
     """
-    try:
-        text = read_file(path, MANIFEST, MOST_MANIFEST)
-        if read_file(path, MARKER, MOST_MARKER).decode("ascii", "replace") != listing({MANIFEST: sha256(text)}):
-            raise OSError(f"a file whose SHA-256 is not the one in {MARKER}")
-        manifest = Manifest.model_validate_json(text)
-    except (OSError, ValidationError) as error:
-        got = _describe(error) if isinstance(error, OSError) else describe_errors(error, "manifest", "; ")
-        raise CheckpointError(
-            f"{path / MANIFEST}: got {got}; wanted a checkpoint's manifest; use another checkpoint"
-        ) from error
+    manifest = read_sealed(path, MANIFEST, MARKER, MOST_MANIFEST, Manifest)
     for name, least in {PARAMETERS: 4 * manifest.size, OPTIMISER: 8 * manifest.size, CONSTANTS: 1}.items():
         size = (path / name).stat().st_size if (path / name).is_file() else 0
         if size < least:

@@ -102,6 +102,8 @@ def routed(
     networks: Sequence[Network], states: Float[Tensor, "steps obs_dim"], chosen: Int[Tensor, " steps"]
 ) -> Float[Tensor, "steps outputs"]:
     """Return at each state the output of its chosen network, which alone is computed there."""
+    if len(states) == 1:
+        return mlp(networks[int(chosen)], states)
     indices = own_states(chosen, len(networks))
     used = [k for k, index in enumerate(indices) if len(index)] or [0]
     if len(used) == 1:

@@ -166,7 +166,7 @@ class Experiment:
             **self._ranges(training_sets),
         )
 
-    def _ranges(self, training_sets: Mapping[str, Sequence[Demonstration]]) -> dict[str, Range]:
+    def _ranges(self, training_sets: Mapping[str, Sequence[Demonstration]]) -> dict[str, Any]:
         """Return what whoever acts later is to know of actions and observations."""
         space = action_space_of(self.suite)
         ends = [(d.observations.min(0), d.observations.max(0)) for task in training_sets.values() for d in task]

@@ -1,0 +1,148 @@
+"""A meta-trained model as its user has it: loaded by name, adapted to a few demonstrations of a new task."""
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from dmil_core.adapted_policy import AdaptedPolicy, Origin
+from dmil_core.checkpoint import FOLDER, MANIFEST, Checkpoint, Range, opened
+from dmil_core.demonstrations import Demonstration
+from dmil_core.errors import RunError, UserError, shorten
+from dmil_core.methods.base import FineTuning, Policy
+from dmil_core.plug_ins import imported, plug_ins
+from dmil_core.policy_tensors import tensors_of
+from dmil_core.recorded import Interface, as_demonstrations, unlike_training
+
+ENTRY_POINTS = "dmil.models"
+"""The group of entry points in which a package registers, by the scheme of an address, what returns the folder of a
+checkpoint: the services register MLflow's ``models`` and ``runs``."""
+
+
+class UnlikeTrainingWarning(UserWarning):
+    """Demonstrations in which some numbers are unlike all that meta-training has seen."""
+
+
+class DivergedError(RunError):
+    """Adaptation that left no policy of use."""
+
+
+class Model:
+    """A checkpoint, ready to adapt. It never changes: each `adapt` begins from the same parameters."""
+
+    def __init__(self, checkpoint: Checkpoint) -> None:
+        """Take a checkpoint that was read."""
+        self.checkpoint = checkpoint
+        self._parameters = checkpoint.tensors()
+
+    @property
+    def fine_tuning(self) -> FineTuning:
+        """Steps and learning rate of adaptation that the checkpoint's run used, the defaults of `adapt`."""
+        evaluation = self.checkpoint.manifest.config.evaluation
+        return FineTuning(evaluation.fine_tuning_steps, evaluation.learning_rate)
+
+    def adapt(
+        self, demonstrations: Sequence[Any], *, steps: int | None = None, learning_rate: float | None = None
+    ) -> AdaptedPolicy:
+        """Return a policy for the task that some demonstrations show; the same ones give the same policy.
+
+        Args:
+            demonstrations: of one task, one or more: pairs (observations, actions) of arrays (steps, numbers) of any
+                real type in the units of meta-training, `Demonstration`, or Minari's episodes; see `as_demonstrations`.
+            steps: gradient steps of adaptation, at least 0; `fine_tuning`'s if not given.
+            learning_rate: of these steps; `fine_tuning`'s if not given.
+
+        Warns:
+            UnlikeTrainingWarning: names the numbers of observations or actions that stand out.
+
+        Raises:
+            UserError: for what is no demonstration of such a robot.
+            DivergedError: if the policy is of no use.
+        """
+        usual = self.fine_tuning
+        fine_tuning = FineTuning(
+            usual.steps if steps is None else steps, usual.learning_rate if learning_rate is None else learning_rate
+        )
+        if fine_tuning.steps < 0 or not 0 < fine_tuning.learning_rate < np.inf:
+            raise UserError(f"adapt: got {fine_tuning}; wanted steps of at least 0 and a learning_rate above 0")
+        actions = self.checkpoint.actions
+        method = self.checkpoint.method(len(actions))
+        manifest = self.checkpoint.manifest.model_copy(update={"actions": actions})
+        interface = Interface.of(manifest, method)
+        support = as_demonstrations(demonstrations, interface)
+        if odd := unlike_training(support, interface):
+            warnings.warn(
+                f"unlike meta-training, {interface.trained_on}: {'; '.join(odd)}; see to units, order and sensors "
+                "before a robot moves",
+                UnlikeTrainingWarning,
+                stacklevel=2,
+            )
+        policy = method.adapt(self._parameters, support, fine_tuning)
+        _check(policy, support, actions, fine_tuning)
+        return AdaptedPolicy(policy, Origin(manifest, self.checkpoint.constants, support, fine_tuning, interface))
+
+
+def load(name: str | Path, runs: str | Path = "runs") -> Model:
+    """Return a model.
+
+    Args:
+        name: a run's name in `runs`, or the folder of a run, whose newest whole checkpoint is then taken, or of a
+            checkpoint; or an address as MLflow's ``models:/ml10@champion``.
+        runs: the folder that runs' own folders are in.
+
+    Raises:
+        UserError: if there is none, or it is damaged.
+    """
+    scheme, colon, _ = str(name).partition(":/")
+    if colon and not Path(name).exists():
+        return Model(Checkpoint(_fetched(scheme, str(name))))
+    for folder in (Path(name), Path(runs) / name):
+        if (folder / MANIFEST).exists() or (folder / FOLDER).is_dir():
+            return Model(opened(folder, lambda damaged: warnings.warn(damaged, stacklevel=4)))
+    raise UserError(
+        f"name: got {shorten(str(name))}; wanted the folder of a run or of a checkpoint, the name of a run in {runs}, "
+        "or models:/NAME@champion"
+    )
+
+
+def _fetched(scheme: str, address: str) -> Path:
+    """Return the folder of a checkpoint that lies somewhere else.
+
+    Raises:
+        UserError: if nobody knows how to get there.
+    """
+    sources = plug_ins(ENTRY_POINTS, lambda name: None)
+    if scheme not in sources:
+        raise UserError(
+            f"name: got {shorten(address)}; wanted a scheme out of {', '.join(sorted(sources)) or 'none'}: install the "
+            "project with its services for MLflow's"
+        )
+    return imported(sources[scheme], "name")(address)
+
+
+@torch.no_grad()
+def _check(policy: Policy, support: Sequence[Demonstration], bounds: Range, fine_tuning: FineTuning) -> None:
+    """See whether a policy does anything like what was demonstrated, in the states of the demonstrations.
+
+    Raises:
+        DivergedError: if a number of it is not finite, or if it is further from the demonstrated actions, on average,
+            than the action space is wide.
+    """
+    observations = np.concatenate([one.observations for one in support])
+    wanted = np.concatenate([one.actions for one in support])
+    width = np.maximum(wanted.max(0), bounds.high) - np.minimum(wanted.min(0), bounds.low)
+    got, most = "numbers that are not finite", float(np.square(width).sum())
+    if all(bool(tensor.isfinite().all()) for tensor in tensors_of(policy).values()):
+        actions = policy.act(observations, policy.start(len(observations))).actions
+        error = float(np.square(actions - wanted).sum(1).mean())
+        if error <= most:
+            return
+        got = f"a mean squared error of {error:.3g}, where {most:.3g} is as far as the action space is wide,"
+    raise DivergedError(
+        f"adaptation diverged: got {got} after {fine_tuning.steps} steps at a learning rate of "
+        f"{fine_tuning.learning_rate:g}; wanted a policy near what was demonstrated; give fewer steps or a smaller "
+        "learning_rate, and see that the demonstrations are in the units of meta-training"
+    )
