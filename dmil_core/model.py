@@ -18,8 +18,8 @@ from dmil_core.policy_tensors import tensors_of
 from dmil_core.recorded import Interface, as_demonstrations, unlike_training
 
 ENTRY_POINTS = "dmil.models"
-"""The group of entry points in which a package registers, by the scheme of an address, what returns the folder of a
-checkpoint: the services register MLflow's ``models`` and ``runs``."""
+"""The group of entry points in which a package registers, by the scheme of an address, what reads a checkpoint:
+the services register MLflow's ``models`` and ``runs``."""
 
 
 class UnlikeTrainingWarning(UserWarning):
@@ -98,7 +98,7 @@ def load(name: str | Path, runs: str | Path = "runs") -> Model:
     """
     scheme, colon, _ = str(name).partition(":/")
     if colon and not Path(name).exists():
-        return Model(Checkpoint(_fetched(scheme, str(name))))
+        return Model(_fetched(scheme, str(name)))
     for folder in (Path(name), Path(runs) / name):
         if (folder / MANIFEST).exists() or (folder / FOLDER).is_dir():
             return Model(opened(folder, lambda damaged: warnings.warn(damaged, stacklevel=4)))
@@ -108,8 +108,8 @@ def load(name: str | Path, runs: str | Path = "runs") -> Model:
     )
 
 
-def _fetched(scheme: str, address: str) -> Path:
-    """Return the folder of a checkpoint that lies somewhere else.
+def _fetched(scheme: str, address: str) -> Checkpoint:
+    """Return a checkpoint that lies somewhere else.
 
     Raises:
         UserError: if nobody knows how to get there.

@@ -22,8 +22,8 @@ from services.suites.registry import open_suite
 from services.tracking.client import connect
 from services.tracking.delivery import Identity
 from services.tracking.links import tracking_uri
-from services.tracking.models import CHECKPOINT_TAG, checkpoint_in, models_of
-from services.tracking.ownership import IDENTITY, check_model
+from services.tracking.models import CHECKPOINT_TAG, download, models_of
+from services.tracking.ownership import IDENTITY
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -97,15 +97,9 @@ def _address(model_id: str) -> str:
 
 
 def _downloaded(client: "MlflowClient", version: "ModelVersion", uri: str, folder: Path) -> Path:
-    """Return the folder of a version's checkpoint: none of a model's code is run."""
-    from mlflow.artifacts import download_artifacts
-
+    """Return the folder of a version's checkpoint."""
     folder.mkdir(parents=True, exist_ok=True)
-    # Not by its address: that is looked up at the process's MLflow, which may be another.
-    model = client.get_logged_model((version.source or "").removeprefix(_address("")))
-    check_model(client, uri, model)
-    files = download_artifacts(artifact_uri=model.artifact_location, dst_path=str(folder), tracking_uri=uri)
-    return checkpoint_in(Path(files))
+    return download(client, uri, client.get_logged_model((version.source or "").removeprefix(_address(""))), folder)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from mlflow.pyfunc.model import PythonModel, PythonModelContext
 
 from dmil_core.checkpoint import Checkpoint
 from dmil_core.demonstrations import Demonstration, digest
-from dmil_core.errors import RunError
+from dmil_core.errors import RunError, UserError, shorten
 from dmil_core.methods.base import FineTuning, Policy
 from services.tracking.packing import unpacked
 
@@ -41,6 +41,8 @@ class Imitator(PythonModel):
     ) -> list[dict[str, Any]]:
         """Return for each row the ``action``, the ``sub_skill`` that chose it, and the ``memory`` for the next step.
 
+        Also the ``support_id``, which the next step may send in place of the support.
+
         Args:
             context: of the model.
             model_input: each row as `unpacked` takes it.
@@ -60,7 +62,8 @@ class Imitator(PythonModel):
     def answer(self, row: Mapping[Any, Any], fine_tuning: FineTuning) -> dict[str, Any]:
         """Return what `predict` does for one row."""
         question = unpacked(row, self._method.obs_dim, self._action_dim)
-        policy = self._policy(question.support, fine_tuning)
+        support_id = question.support_id or digest(question.support)
+        policy = self._policy(support_id, question.support, fine_tuning)
         memory = policy.start(1) if question.memory is None else question.memory[None]
         decision = policy.act(question.observation[None], memory)
         if not np.isfinite(decision.actions).all():
@@ -73,11 +76,17 @@ class Imitator(PythonModel):
             "action": decision.actions[0].tolist(),
             "sub_skill": int(decision.sub_skills[0]),
             "memory": decision.memory[0].tolist(),
+            "support_id": support_id,
         }
 
-    def _policy(self, support: tuple[Demonstration, ...], fine_tuning: FineTuning) -> Policy:
-        key = digest(support), fine_tuning
+    def _policy(self, support_id: str, support: tuple[Demonstration, ...], fine_tuning: FineTuning) -> Policy:
+        key = support_id, fine_tuning
         if key not in self.policies:
+            if not support:
+                raise UserError(
+                    f"support_id: got {shorten(support_id)}; wanted one of the last {POLICIES_KEPT} support sets, with "
+                    "the same params; send the support again"
+                )
             if len(self.policies) >= POLICIES_KEPT:
                 del self.policies[next(iter(self.policies))]
             self.policies[key] = self._method.adapt(self._parameters, support, fine_tuning)

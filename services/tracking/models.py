@@ -7,7 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 from dmil_core.checkpoint import FILES, MARKER, Checkpoint
 from dmil_core.configs import EvaluationConfig
+from dmil_core.errors import UserError
 from dmil_core.files import copy_plain, inside
+from services.storage.redaction import error_line, redacted
+from services.tracking.client import connect
+from services.tracking.links import tracking_uri
+from services.tracking.ownership import check_model
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -37,6 +42,54 @@ def checkpoint_in(model: Path) -> Path:
     from mlflow.models import Model
 
     return inside(model, Model.load(str(model)).flavors["python_function"]["artifacts"]["checkpoint"]["path"])
+
+
+def download(client: "MlflowClient", uri: str, model: "LoggedModel", folder: Path) -> Path:
+    """Download a model into `folder`, and return the folder of its checkpoint: none of a model's code is run.
+
+    Raises:
+        UserError: if it lies elsewhere than among the artifacts of its experiment.
+    """
+    from mlflow.artifacts import download_artifacts
+
+    check_model(client, uri, model)
+    # Not by its address: that is looked up at the process's MLflow, which may be another.
+    files = download_artifacts(artifact_uri=model.artifact_location, dst_path=str(folder), tracking_uri=uri)
+    return checkpoint_in(Path(files))
+
+
+def checkpoint_at(address: str) -> Checkpoint:
+    """Read the checkpoint of a model in the MLflow of ``MLFLOW_TRACKING_URI``; `dmil_core.load` asks for it.
+
+    Args:
+        address: ``models:/NAME@ALIAS``, ``models:/NAME/VERSION``, ``models:/ID`` or ``runs:/RUN_ID/model``.
+
+    Raises:
+        UserError: if there is none, or MLflow does not answer.
+    """
+    uri = tracking_uri()
+    client = connect(uri)
+    from mlflow.exceptions import MlflowException
+
+    with tempfile.TemporaryDirectory() as made:
+        try:
+            return Checkpoint(download(client, uri, _model_at(client, address), Path(made)))
+        except (MlflowException, OSError, IndexError) as error:
+            raise UserError(
+                f"{address}: got no model at {redacted(uri)}: {error_line(error)}; wanted models:/NAME@ALIAS, "
+                "models:/NAME/VERSION, models:/ID or runs:/RUN_ID/model; set MLFLOW_TRACKING_URI to the run's"
+            ) from None  # its text may hold secrets
+
+
+def _model_at(client: "MlflowClient", address: str) -> "LoggedModel":
+    scheme, _, place = address.partition(":/")
+    if scheme == "runs":
+        return models_of(client, client.get_run(place.partition("/")[0]))[0]
+    name, alias, label = place.partition("@") if "@" in place else place.partition("/")
+    if not alias:
+        return client.get_logged_model(name)
+    found = client.get_model_version_by_alias if alias == "@" else client.get_model_version
+    return client.get_logged_model((found(name, label).source or "").removeprefix("models:/"))
 
 
 def log_model(client: "MlflowClient", run_id: str, checkpoint: Checkpoint, example: dict[str, Any]) -> None:
@@ -94,7 +147,8 @@ def _signature(evaluation: EvaluationConfig) -> "ModelSignature":
     return ModelSignature(
         inputs=Schema(
             [
-                ColSpec(Array(demonstration), "support"),
+                ColSpec(Array(demonstration), "support", required=False),
+                ColSpec(DataType.string, "support_id", required=False),
                 ColSpec(Array(DataType.double), "observation"),
                 ColSpec(Array(DataType.long), "memory", required=False),
             ]
@@ -104,6 +158,7 @@ def _signature(evaluation: EvaluationConfig) -> "ModelSignature":
                 ColSpec(Array(DataType.double), "action"),
                 ColSpec(DataType.long, "sub_skill"),
                 ColSpec(Array(DataType.long), "memory"),
+                ColSpec(DataType.string, "support_id"),
             ]
         ),
         params=ParamSchema(

@@ -14,6 +14,8 @@ class Question(NamedTuple):
     """What the model is asked: what to do after having seen a support set."""
 
     support: tuple[Demonstration, ...]
+    """None after the first step, where the id of an earlier answer names it."""
+    support_id: str | None
     observation: Float32[np.ndarray, " obs_dim"]
     memory: Int64[np.ndarray, " memory_dim"] | None
     """What the step before returned; none at the first step of an episode."""
@@ -32,23 +34,29 @@ def unpacked(request: Mapping[str, Any], obs_dim: int, action_dim: int) -> Quest
     """Return what a model's input asks.
 
     Args:
-        request: ``support``, a list of demonstrations with ``observations`` and ``actions``, one row a step;
-            ``observation``; and, after the first step, the ``memory``.
+        request: ``support``, a list of demonstrations with ``observations`` and ``actions``, one row a step, or the
+            ``support_id`` of an earlier answer; ``observation``; and, after the first step, the ``memory``.
         obs_dim: numbers in an observation.
         action_dim: numbers in an action.
 
     Raises:
         UserError: names the part that is wrong, what it got and what was wanted.
     """
-    support = request.get("support")
-    if not isinstance(support, Sequence | np.ndarray) or isinstance(support, str) or len(support) == 0:
-        raise UserError(f"support: got {shorten(support)}; wanted a list of at least one demonstration")
+    support, support_id = request.get("support"), request.get("support_id")
+    if isinstance(support_id, str):
+        support = ()
+    elif not isinstance(support, Sequence | np.ndarray) or isinstance(support, str) or len(support) == 0:
+        raise UserError(
+            f"support: got {shorten(support)}; wanted a list of at least one demonstration, or the support_id of an "
+            "earlier answer"
+        )
     observation = _numbers(request.get("observation"), "observation", (obs_dim,))
     if not np.isfinite(observation).all():
         raise UserError("observation: got numbers that are not finite; wanted real numbers only")
     memory = request.get("memory")
     return Question(
         tuple(_demonstration(one, number, obs_dim, action_dim) for number, one in enumerate(support)),
+        support_id if isinstance(support_id, str) else None,
         observation,
         None if memory is None else _memory(memory),
     )

@@ -13,6 +13,7 @@ from mlflow import MlflowClient
 from mlflow.artifacts import download_artifacts
 from mlflow.pyfunc.model import PythonModelContext
 
+import dmil_core as dmil
 from dmil_core.checkpoint import Checkpoint
 from dmil_core.configs import preset_of
 from dmil_core.errors import RunError, UserError
@@ -75,6 +76,9 @@ def test_it_acts_as_the_adapted_policy_step_by_step(untrained, kind: type[Imitat
         answer = imitator.answer(asked, STEPS)
         np.testing.assert_array_equal(np.float32(answer["action"]), decision.actions[0])
         assert answer["sub_skill"] == decision.sub_skills[0]
+        if "support_id" in answer:
+            by_id = imitator.answer(asked | {"support": None, "support_id": answer["support_id"]}, STEPS)
+            assert by_id == answer
         memory, remembered = decision.memory, answer["memory"]
         assert remembered == memory[0].tolist()
 
@@ -105,8 +109,12 @@ def test_mlflow_loads_it_without_pickle_and_predicts(untrained, own_mlflow: str,
     inputs, outputs = loaded.metadata.get_input_schema(), loaded.metadata.get_output_schema()
     assert inputs is not None
     assert outputs is not None
-    assert inputs.input_names() == ["support", "observation", "memory"]
-    assert outputs.input_names() == ["action", "sub_skill", "memory"]
+    assert inputs.input_names() == ["support", "support_id", "observation", "memory"]
+    assert outputs.input_names() == ["action", "sub_skill", "memory", "support_id"]
+    for address in (f"models:/{model.model_id}", f"runs:/{run_id}/model"):
+        assert dmil.load(address).checkpoint.digest == checkpoint.digest
+    with pytest.raises(UserError, match=r"nobody@champion: got no model at sqlite:.*; wanted models:/NAME@"):
+        dmil.load("models:/nobody@champion")
 
     observation = support[0].observations[5]
     params = {"fine_tuning_steps": STEPS.steps, "learning_rate": STEPS.learning_rate}
@@ -114,6 +122,10 @@ def test_mlflow_loads_it_without_pickle_and_predicts(untrained, own_mlflow: str,
     for asked in (packed(support, observation), packed(support, observation) | {"observation": observation}):
         (answer,) = loaded.predict(asked, params=params)
         np.testing.assert_array_equal(np.float32(answer["action"]), wanted.actions[0])
+    asked = {"support_id": answer["support_id"], "observation": observation}
+    assert loaded.predict(asked, params=params) == [answer]
+    with pytest.raises(UserError, match=r"got 'nothing'; wanted one of the last 16 .*; send the support again"):
+        loaded.predict(asked | {"support_id": "nothing"}, params=params)
     (shown,) = loaded.predict(loaded.input_example, params=params)
     assert len(shown["action"]) == 4
     (snippet,) = re.findall(r"```python\n(.*?)```", GUIDE.read_text(), re.DOTALL)
