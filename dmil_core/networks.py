@@ -5,13 +5,14 @@ networks along the first axis of every tensor; `bank` and `network` give views o
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.optim.adam import adam
 
 Parameters: TypeAlias = Mapping[str, Tensor]
 
@@ -122,7 +123,38 @@ def without_graph(parameters: Parameters) -> dict[str, Tensor]:
     return {name: tensor.detach() for name, tensor in parameters.items()}
 
 
-def descend(optimiser: torch.optim.Optimizer, loss: Float[Tensor, ""]) -> None:
+class Adam:
+    """Adam with decoupled weight decay (Loshchilov and Hutter, ICLR 2019), the fused kernel of `torch.optim.AdamW`.
+
+    The first step of an optimiser of `torch.optim` imports torch's compiler, which takes seconds in each process.
+    """
+
+    def __init__(self, parameters: Iterable[Tensor], learning_rate: float, weight_decay: float = 0.0) -> None:
+        """Begin with moments of zero."""
+        self.parameters = list(parameters)
+        self.steps = [torch.tensor(0.0) for _ in self.parameters]
+        self.first_moments = [torch.zeros_like(tensor) for tensor in self.parameters]
+        self.second_moments = [torch.zeros_like(tensor) for tensor in self.parameters]
+        self._learning_rate, self._weight_decay = learning_rate, weight_decay
+
+    def zero_grad(self) -> None:
+        """Forget the gradients."""
+        for tensor in self.parameters:
+            tensor.grad = None
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Change in place all parameters that have a gradient."""
+        state = zip(self.parameters, self.first_moments, self.second_moments, self.steps, strict=True)
+        tensors = [(of[0], of[0].grad, *of[1:]) for of in state if of[0].grad is not None]
+        parameters, gradients, first, second, steps = map(list, zip(*tensors, strict=True))
+        adam(
+            parameters, gradients, first, second, [], steps, fused=True, decoupled_weight_decay=True, amsgrad=False,
+            beta1=0.9, beta2=0.999, lr=self._learning_rate, weight_decay=self._weight_decay, eps=1e-8, maximize=False,
+        )  # fmt: skip
+
+
+def descend(optimiser: Adam | torch.optim.Optimizer, loss: Float[Tensor, ""]) -> None:
     """Take one step of an optimiser down a loss."""
     optimiser.zero_grad()
     loss.backward()

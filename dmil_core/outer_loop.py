@@ -13,7 +13,7 @@ from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import as_work_error
 from dmil_core.methods.base import MetaLearner, OnlineMetaLearner, Policy, TaskGradient
-from dmil_core.networks import Parameters
+from dmil_core.networks import Adam, Parameters
 from dmil_core.seeding import named_rng, named_seed
 from dmil_core.trajectories import Rollout
 
@@ -163,12 +163,10 @@ class OuterStep:
         """Continue from `state`; a fresh start is `OuterState.start`."""
         self._training = training
         self._parameters = torch.nn.Parameter(torch.tensor(state.parameters))
-        self._adam = torch.optim.Adam([self._parameters], lr=training.learning_rate, fused=True)
-        self._adam.state[self._parameters] = {
-            "step": torch.tensor(float(state.iteration)),
-            "exp_avg": torch.tensor(state.first_moment),
-            "exp_avg_sq": torch.tensor(state.second_moment),
-        }
+        self._adam = Adam([self._parameters], training.learning_rate)
+        self._adam.steps = [torch.tensor(float(state.iteration))]
+        self._adam.first_moments = [torch.tensor(state.first_moment)]
+        self._adam.second_moments = [torch.tensor(state.second_moment)]
 
     @property
     def parameters(self) -> Float[Tensor, " size"]:
@@ -196,11 +194,11 @@ class OuterStep:
 
     def skip(self) -> None:
         """Count an iteration without a step of Adam; parameters and moments stay."""
-        self._adam.state[self._parameters]["step"] += 1
+        self._adam.steps[0] += 1
 
     @property
     def state(self) -> OuterState:
         """A copy of everything that the next step depends on."""
-        adam = self._adam.state[self._parameters]
-        moments = (adam[name].numpy().copy() for name in ("exp_avg", "exp_avg_sq"))
-        return OuterState(int(adam["step"]), self.parameters.numpy().copy(), *moments)
+        (step,), first, second = self._adam.steps, self._adam.first_moments, self._adam.second_moments
+        moments = (moment.numpy().copy() for (moment,) in (first, second))
+        return OuterState(int(step), self.parameters.numpy().copy(), *moments)

@@ -1,12 +1,12 @@
 """Success rates and scores with their intervals, and how evenly sub-skills are used."""
 
 from collections.abc import Sequence
-from math import isnan, nan
+from math import isnan, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import binomtest, entropy, t, trim_mean
+from scipy.special import entr, ndtri, stdtrit  # scipy.stats takes a second to import
 
 
 class Mean(NamedTuple):
@@ -39,9 +39,11 @@ def success_rate(outcomes: Sequence[bool], confidence: float = 0.95) -> Mean:
     """
     if not outcomes:
         raise ValueError("outcomes: got no episode; a success rate needs at least one")
-    successes = sum(map(bool, outcomes))
-    interval = binomtest(successes, len(outcomes)).proportion_ci(confidence, method="wilson")
-    return Mean(successes / len(outcomes), float(interval.low), float(interval.high), len(outcomes))
+    n, successes = len(outcomes), sum(map(bool, outcomes))
+    z, rate = float(ndtri((1 + confidence) / 2)), successes / n
+    whole = 2 * (n + z**2)
+    centre, half = (2 * n * rate + z**2) / whole, z / whole * sqrt(4 * n * rate * (1 - rate) + z**2)
+    return Mean(rate, centre - half if successes else 0.0, centre + half if successes < n else 1.0, n)
 
 
 def mean_score(scores: Sequence[float], confidence: float = 0.95) -> Mean:
@@ -56,7 +58,7 @@ def mean_score(scores: Sequence[float], confidence: float = 0.95) -> Mean:
     if episodes == 1:
         return Mean(mean, nan, nan, 1)
     deviation = float(np.std(scores, ddof=1))
-    half = float(t.ppf((1 + confidence) / 2, episodes - 1)) * deviation / episodes**0.5
+    half = float(stdtrit(episodes - 1, (1 + confidence) / 2)) * deviation / episodes**0.5
     return Mean(mean, mean - half, mean + half, episodes, deviation)
 
 
@@ -65,7 +67,7 @@ def share_entropy(shares: Float[np.ndarray, " sub_skills"]) -> float:
 
     One sub-skill alone has no choice to make; its entropy is 0.
     """
-    return float(entropy(shares) / np.log(len(shares))) if len(shares) > 1 else 0.0
+    return float(entr(shares / shares.sum()).sum() / np.log(len(shares))) if len(shares) > 1 else 0.0
 
 
 BOOTSTRAP_DRAWS = 2000
@@ -96,7 +98,8 @@ def stratified_bootstrap(
 
 def interquartile_mean(values: Sequence[float]) -> float:
     """Return the mean of the middle half of `values` (Agarwal et al., NeurIPS 2021: of all runs on all tasks)."""
-    return float(trim_mean(values, 0.25))
+    cut = len(values) // 4
+    return float(np.mean(np.sort(values)[cut : len(values) - cut]))
 
 
 def performance_profile(

@@ -56,7 +56,7 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
         "[seed, *np": "[0, *np",
     },
     ("dmil_core/statistics.py", "dmil_core/test_statistics.py"): {
-        'method="wilson"': 'method="exact"',
+        "z**2) / whole": "0) / whole",
         "draw.integers(seeds, size=BOOTSTRAP_DRAWS)": "[place] * BOOTSTRAP_DRAWS",
     },
     ("dmil_core/methods/ppo.py", "dmil_core/methods/test_ppo.py"): {

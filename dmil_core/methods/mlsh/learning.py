@@ -12,7 +12,7 @@ from dmil_core.losses import Steps, squared_errors
 from dmil_core.methods.mlsh.config import MlshConfig
 from dmil_core.methods.mlsh.macro_steps import MacroSteps, draw_batch, macro_steps
 from dmil_core.methods.ppo import clipped_surrogate, normalised, scaled, trajectory_advantages
-from dmil_core.networks import Parameters, bank, descend, leaves, mlp, network, routed, without_graph
+from dmil_core.networks import Adam, Parameters, bank, descend, leaves, mlp, network, routed, without_graph
 
 FRESH_SCALE = 0.01
 """Scale of a fresh high level's last layer, against He's."""
@@ -23,7 +23,7 @@ class Learner:
 
     def __init__(self, parameters: Parameters, learning_rate: float) -> None:
         self.parameters = leaves(parameters, copy=True)
-        self._adam = torch.optim.Adam(self.parameters.values(), lr=learning_rate, fused=True)
+        self._adam = Adam(self.parameters.values(), learning_rate)
 
     def descend(self, loss: Tensor) -> None:
         """Take a step of Adam down a loss."""

@@ -18,7 +18,7 @@ from dmil_core.losses import Steps
 from dmil_core.methods.option_gail.config import OptionGailConfig
 from dmil_core.methods.option_gail.option_model import OptionModel, options_before
 from dmil_core.methods.ppo import clipped_surrogate, trajectory_advantages
-from dmil_core.networks import Parameters, descend, mlp, network
+from dmil_core.networks import Adam, Parameters, descend, mlp, network
 from dmil_core.trajectories import Rollout
 
 POLICY = ("high.", "low.", "log_deviations")
@@ -90,9 +90,7 @@ def discriminate(
 ) -> dict[str, float]:
     """Train the discriminator in place, each minibatch of the policy's steps against as many demonstrated ones."""
     losses, k = [], config.sub_skills
-    descent = torch.optim.AdamW(
-        named(moved, "discriminator."), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
-    )
+    descent = Adam(named(moved, "discriminator."), config.learning_rate, config.weight_decay)
     for index in _minibatches(len(batch.options), config.minibatch, config.discriminator_passes, generator):
         others = torch.randint(len(expert.options), (len(index),), generator=generator)
         of_policy, of_expert = (discriminator_logits(moved, side, k) for side in (batch.at(index), expert.at(others)))
@@ -191,9 +189,7 @@ def improve(
     """Improve both levels and the critic in place, down L = −L_clip of either level − c·entropy + ½(V_L − return)²."""
     with torch.no_grad():
         old = decisions(moved, batch, config)
-    descent = torch.optim.AdamW(
-        named(moved, (*POLICY, "critic.")), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
-    )
+    descent = Adam(named(moved, (*POLICY, "critic.")), config.learning_rate, config.weight_decay)
     for index in _minibatches(len(batch.options), config.minibatch, config.policy_epochs, generator):
         some = batch.at(index)
         new = decisions(moved, some, config)

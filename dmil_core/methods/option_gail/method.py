@@ -33,7 +33,7 @@ from dmil_core.methods.option_gail.option_model import (
     weighted_log_likelihood,
 )
 from dmil_core.methods.option_gail.policy import OptionExplorationPolicy, OptionPolicy
-from dmil_core.networks import Parameters, descend, flat_gradient, flatten, initialise, leaves, without_graph
+from dmil_core.networks import Adam, Parameters, descend, flat_gradient, flatten, initialise, leaves, without_graph
 from dmil_core.trajectories import Rollout
 
 Phase = Literal["likelihood", "hard", "adversarial"]
@@ -70,7 +70,7 @@ class _Options(MetaLearner[Any, OptionBatch]):
         """Take steps of Adam up the complete-data log-likelihood of the support set, relabelled before each."""
         policy = {name: tensor for name, tensor in parameters.items() if name.startswith(POLICY)}
         adapted = leaves(policy, copy=True)
-        descent = torch.optim.Adam(adapted.values(), lr=fine_tuning.learning_rate, fused=True)
+        descent = Adam(adapted.values(), fine_tuning.learning_rate)
         steps = Steps.of(support, self.normalise)
         for _ in range(fine_tuning.steps):
             descend(descent, self._em_loss(adapted, steps, "hard").loss)
@@ -170,7 +170,7 @@ class OptionGail(_Options, OnlineMetaLearner[Any, OptionBatch]):
 
     def _offline_steps(self, moved: dict[str, Tensor], demonstrated: Steps, phase: Phase) -> dict[str, float]:
         """Descend in place, and return the metrics before."""
-        descent = torch.optim.Adam(named(moved, POLICY), lr=self.config.offline_learning_rate, fused=True)
+        descent = Adam(named(moved, POLICY), self.config.offline_learning_rate)
         metrics = []
         for _ in range(self.config.offline_steps):
             em = self._em_loss(moved, demonstrated, phase)
