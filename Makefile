@@ -21,7 +21,8 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@echo "setup 1/2: $$($(PYTHON) --version) into .venv"
 	@$(PYTHON) -m venv .venv
 	@echo "setup 2/2: the project and its pinned dependencies, some minutes the first time"
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test]'
+	@$(BIN)/python -m pip install -qq --no-compile --disable-pip-version-check -c constraints.txt -e '.[test]'
+	@$(BIN)/python -m compileall -qq -j 0 .venv/lib || true # on all cores; a few files of packages are no Python 3
 	@touch $@
 
 train: setup ## meta-train; its options go in ARGS: make train ARGS="--help"

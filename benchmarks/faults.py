@@ -33,8 +33,8 @@ VICTIMS = {"worker": 7, "all workers": 1, "learner": 2, "driver": 1}
 """What is killed, and how often against the others."""
 KILLS_PER_RUN = 10
 SETTINGS = (
-    "--preset", "ml10-smoke", "--workers", "2", "--training.iterations", "480", "--training.checkpoint-every", "20",
-    "--training.tasks-per-iteration", "4", "--evaluation.every", "160",
+    "--preset", "ml10-smoke", "--workers", "2", "--training.checkpoint-every", "20",
+    "--training.tasks-per-iteration", "4",
 )  # fmt: skip
 SECONDS_BETWEEN = 3.0
 """Mean time from one kill to the next, while a learner or a worker is there."""
@@ -54,6 +54,8 @@ class Arguments(BenchmarkArguments):
     """How many processes, or groups of them at once, are killed in all."""
     seed: int = 0
     """Of the moments and the victims."""
+    iterations: int = 480
+    """Of each run; it is evaluated after each third of them."""
     folder: Path | None = None
     """Keep demonstrations and runs here; else they go when all is over."""
 
@@ -70,9 +72,11 @@ class Outcome(NamedTuple):
 class Campaign:
     """Runs of one experiment in one folder."""
 
-    def __init__(self, folder: Path, draw: random.Random) -> None:
+    def __init__(self, folder: Path, draw: random.Random, iterations: int) -> None:
         """Run in `folder`, where all runs share their demonstrations."""
         self.folder, self._draw = folder, draw
+        schedule = ("--training.iterations", str(iterations), "--evaluation.every", str(max(1, iterations // 3)))
+        self._settings = (*SETTINGS, *schedule)
         self._environment = os.environ | {"MLFLOW_TRACKING_URI": f"sqlite:///{folder / 'mlflow.db'}"}
         self._environment.pop("RAY_ADDRESS", None)
         self._environment["PYTHONPATH"] = str(Path(__file__).parents[1])
@@ -108,7 +112,7 @@ class Campaign:
 
     def _start(self, name: str, log: Any) -> psutil.Popen:
         begun = (self.folder / "runs" / name / "config.json").exists()
-        which = ["--resume", name] if begun else ["--name", name, *SETTINGS]
+        which = ["--resume", name] if begun else ["--name", name, *self._settings]
         command = [sys.executable, "-m", "services.meta_train", *which]
         return psutil.Popen(
             command,
@@ -210,7 +214,7 @@ def run(args: Arguments) -> Row:
     """Run the benchmark."""
     folder = args.folder or Path(tempfile.mkdtemp(prefix="dmil-faults-"))
     folder.mkdir(parents=True, exist_ok=True)
-    campaign = Campaign(folder.resolve(), random.Random(args.seed))
+    campaign = Campaign(folder.resolve(), random.Random(args.seed), args.iterations)
     try:
         campaign.collect()
         undisturbed = campaign.run("undisturbed", 0)

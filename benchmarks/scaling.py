@@ -55,6 +55,8 @@ class Arguments(BenchmarkArguments):
 
     sizes: tuple[Size, ...] = ("quick", "paper")
     """Networks, batches and windows of the presets ml10-quick and ml10-paper."""
+    iterations: int | None = None
+    """In each turn, if not as many as a size has on its own."""
     rounds: int | None = None
     """Turns that each takes; by default 6 at quick size and 2 at paper size."""
 
@@ -150,7 +152,7 @@ def run(args: Arguments) -> Sequence[harness.Row]:
     try:
         for size in args.sizes:
             plan, turns = made_up_plan(f"ml10-{size}", SLOTS_PER_GROUP), TURNS[size]
-            turns = turns._replace(rounds=args.rounds or turns.rounds)
+            turns = Turns(args.rounds or turns.rounds, args.iterations or turns.iterations)
             console.print(f"{size}: {turns.rounds} rounds of {turns.iterations} iterations")
             trainings: dict[str, MetaTraining] = {"local": LocalMetaTraining(plan)}
             trainings |= {f"ray {workers}": RayMetaTraining(plan, workers) for workers in WORKERS}

@@ -57,7 +57,7 @@ def test_simulation(tmp_path: Path) -> None:
 
 @pytest.mark.thorough
 def test_scaling(tmp_path: Path) -> None:
-    rows = rows_of("scaling", "--sizes", "quick", "--rounds", "1", folder=tmp_path)
+    rows = rows_of("scaling", "--sizes", "quick", "--rounds", "1", "--iterations", "2", folder=tmp_path)
     assert [(row["runner"], row["workers"], row["size"]) for row in rows] == [
         ("local", 1, "quick"),
         ("ray", 1, "quick"),
@@ -98,7 +98,8 @@ def test_tracking(tmp_path: Path) -> None:
 @pytest.mark.thorough
 @pytest.mark.timeout(1800)
 def test_faults(tmp_path: Path) -> None:
-    found = rows_of("faults", "--kills", "5", "--seed", "1", "--folder", str(tmp_path / "campaign"), folder=tmp_path)
-    assert (found["kills"], found["equal"], found["lost"], found["different"]) == (5, 5, 0, 0)
+    small = ("--kills", "2", "--seed", "1", "--iterations", "120", "--folder", str(tmp_path / "campaign"))
+    found = rows_of("faults", *small, folder=tmp_path)
+    assert (found["kills"], found["equal"], found["lost"], found["different"]) == (2, 2, 0, 0)
     assert found["seconds"] > 0
     assert set(found["cost"]) == {"worker", "all workers", "learner", "driver"}

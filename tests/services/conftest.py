@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import jaxtyping
 import pytest
 from mlflow import MlflowClient
 
@@ -28,7 +29,9 @@ from services.demonstrations.store import DemoStore, TaskDemonstrations
 from services.distributed.ray_runner import open_runner
 from services.experiments.experiment import Experiment
 from services.experiments.finished_run import FinishedRun
+from services.reporting import run_report
 from services.storage.checkpoints import Checkpoints
+from services.suites import metaworld_speed
 from tests.services.pages import browser, open_page  # noqa: F401  fixtures
 
 PROJECT = Path(__file__).parents[2]
@@ -46,6 +49,21 @@ def _console() -> Iterator[None]:
     """A test that calls a program's `run` reads on the console what was logged, as where the program was started."""
     with console_logging(quiet=False):
         yield
+
+
+@pytest.fixture(autouse=True)
+def _unchecked_shapes() -> Iterator[None]:
+    """Whole runs take some times as long where every shape of them is checked, as in the tests of dmil_core."""
+    before = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", before)
+
+
+@pytest.fixture
+def checked_shapes(_unchecked_shapes: None) -> None:
+    """Checks the shapes of this test after all."""
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture
@@ -312,8 +330,20 @@ def programs(workplace: Path) -> Iterator[Programs]:
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _models_kept() -> None:
+    """A process of tests builds the environments of a few tasks again and again: their models are compiled once."""
+    metaworld_speed._compiled = functools.lru_cache(maxsize=8)(metaworld_speed._compiled.__wrapped__)
+
+
 @pytest.fixture
-def train(workplace: Path) -> Callable[..., Checkpoint]:
+def plain_pages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page of a run that ends has its table, and not the pictures, which take longer than a small run."""
+    monkeypatch.setattr(run_report, "write_run_page", functools.partial(run_report.write_run_page, sections=()))
+
+
+@pytest.fixture
+def train(workplace: Path, plain_pages: None) -> Callable[..., Checkpoint]:
     """Meta-trains in this process, and returns the newest checkpoint of the run `name`."""
 
     def run(name: str, *arguments: str, resume: bool = False) -> Checkpoint:

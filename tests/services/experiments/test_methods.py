@@ -88,6 +88,7 @@ def test_a_killed_online_run_goes_on_to_the_same_bits(programs, wait_for, workpl
     assert states[0].manifest.environment_steps == states[1].manifest.environment_steps
 
 
+@pytest.mark.usefixtures("checked_shapes")
 @pytest.mark.parametrize("method", LEARNERS)
 def test_a_slot_is_a_pure_function(store: DemoStore, data, method: str):
     """Again in a worker that has done other things before: the same bits, and the parameters are as they were."""
@@ -108,6 +109,7 @@ def test_a_slot_is_a_pure_function(store: DemoStore, data, method: str):
     assert np.array_equal(plan.state.parameters, plan_of(experiment, data).state.parameters)
 
 
+@pytest.mark.usefixtures("checked_shapes")
 @pytest.mark.parametrize("method", OURS)
 def test_constants_and_a_single_step_are_enough_to_act(experiment: Experiment, data, method: str):
     kind = method_type(method)

@@ -18,6 +18,7 @@ from services.storage.checkpoints import Checkpoints
 from tests.services.conftest import QUICK_EVALUATION
 from tests.services.experiments.same_bits import METHODS, RUNS, processor, train
 
+pytestmark = pytest.mark.usefixtures("plain_pages")
 KNOWN = json.loads(Path(__file__).with_name("same_bits.json").read_text())
 OLD = Path(__file__).with_name("old_checkpoints")
 QUICK = [f"{method}-0" for method in METHODS]

@@ -8,10 +8,12 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import ClassVar
 
 import fsspec
 import numpy as np
 import pytest
+from fsspec.implementations.memory import MemoryFileSystem
 
 from dmil_core.checkpoint import FILES, MARKER, Checkpoint, CheckpointError
 from dmil_core.configs import PRESETS
@@ -112,6 +114,26 @@ def test_of_two_writers_of_a_file_one_is_told_that_it_is_another_s(url: str):
     assert storage.create("runs/run/claim", b"one", 10) == b"one"
     assert storage.create("runs/run/claim", b"other", 10) == b"one"
     assert storage.create("runs/run/claim", b"one", 10) == b"one"
+
+
+class WithoutNew(MemoryFileSystem):
+    """Files in memory, of a library that has no mode for a file that must not be there yet."""
+
+    protocol = "without-new"
+    store: ClassVar[dict] = {}
+    pseudo_dirs: ClassVar[list] = [""]
+
+    def _open(self, path, mode="rb", **options):
+        if "x" in mode:
+            raise NotImplementedError(mode)
+        return super()._open(path, mode, **options)
+
+
+def test_a_file_is_made_once_too_where_no_mode_is_for_that():
+    fsspec.register_implementation("without-new", WithoutNew, clobber=True)
+    storage = Storage("without-new://lab")
+    assert storage.create("runs/run/claim", b"one", 10) == b"one"
+    assert storage.create("runs/run/claim", b"other", 10) == b"one"
 
 
 def stored(storage: Storage) -> list[bytes | None]:

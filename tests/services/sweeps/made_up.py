@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
+from dmil_core.settings import sub_skills_of
 from services.evaluation.results import AdaptationResult, EpisodeResult, write_rows
 from services.sweeps.folders import SweepFolder, SweepRecord, TrialResult
 from services.sweeps.settings import Sweep
@@ -25,14 +26,20 @@ def make(runs: Path, solved: Solved, finished: Sequence[str] = (), **changes: ob
         "what": "a test", "suites": ["ml10"], "seeds": [0, 1, 2], "variants": {"DMIL": {}, "DMIL-High": {}},
         "paper": "table4", **changes,
     }  # fmt: skip
+    return make_of(runs, Sweep.model_validate(settings), solved, finished)
+
+
+def make_of(runs: Path, settings: Sweep, solved: Solved, finished: Sequence[str] = ()) -> SweepFolder:
+    """Write the folder of a sweep at preset smoke, with trials as if they had run."""
     record = SweepRecord(
-        name="made-up", preset="smoke", sweep=Sweep.model_validate(settings), began=datetime(2026, 1, 2, tzinfo=UTC),
+        name="made-up", preset="smoke", sweep=settings, began=datetime(2026, 1, 2, tzinfo=UTC),
         command="python -m services.tune_sweep made-up", commit="abc", versions={},
     )  # fmt: skip
     sweep = SweepFolder.make(runs / "made-up", record)
     for number, (name, trial) in enumerate(sweep.trials.items()):
         if finished and trial.variant not in finished:
             continue
+        sub_skills = sub_skills_of(trial.config.method)
         folder = runs / "trained" / str(number) / "evaluated" / "one"
         folder.mkdir(parents=True)
         episodes, adaptations = [], []
@@ -48,7 +55,8 @@ def make(runs: Path, solved: Solved, finished: Sequence[str] = (), **changes: ob
                                 | {"score": int(value), "steps": 3, "sub_skill_steps": (3,)}
                             )
                         )
-                    steps = (60, 40, 0) if shots == 1 else (97, 3, 0)
+                    most = (60, 40) if shots == 1 else (97, 3)
+                    steps = (*most, *[0] * (sub_skills - 2)) if sub_skills > 1 else (100,)
                     use = {"steps": 100, "agreeing": 5, "sub_skill_steps": steps}
                     adaptations.append(AdaptationResult.model_validate({**common, **use}))
         write_rows(folder / "episodes.jsonl", episodes)

@@ -1,6 +1,6 @@
-"""Sweeps of tune_configs, at preset smoke, as a user runs them: real Tune, real MLflow.
+"""Sweeps of tune_configs at preset smoke: the tables of all, and one as a user runs it: real Tune, real MLflow.
 
-Those that are not run here vary one setting, as `em` does; `test_settings` plans the trials of all.
+`test_settings` plans the trials of all; each method's own training is in `test_same_bits`.
 """
 
 import json
@@ -14,7 +14,10 @@ from mlflow.entities import Run
 
 from services import tune_sweep
 from services.sweeps.folders import SweepFolder
-from tests.services.sweeps.test_settings import NAMES
+from services.sweeps.table_formats import write_tables
+from services.tune_sweep import CONFIGS
+from tests.services.sweeps.made_up import better, make_of
+from tests.services.sweeps.test_settings import NAMES, sweep_of
 
 ROWS = {
     "bilevel": ["DMIL", "DMIL-High", "DMIL-Low", "OptionGAIL"],
@@ -37,20 +40,25 @@ FLAT = {"MIL", "PEMIRL", "behaviour cloning", "per task", "nearest neighbour"}
 """Rows of methods without sub-skills."""
 
 
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of all sweeps here: what one has trained, the next ones need not."""
-    return tmp_path_factory.mktemp("runs")
+@pytest.mark.parametrize("name", ROWS)
+def test_each_sweep_has_its_table(tmp_path: Path, name: str) -> None:
+    sweep = make_of(tmp_path, sweep_of(name).at("smoke"), better)
+    tables = write_tables(sweep)
+    assert {path.name for path in (sweep.path / "tables").iterdir()} >= {"report.html", "table.png", "tables.json"}
+    assert list(dict.fromkeys(cell.row for cell in tables.cells)) == ROWS[name]
+    assert all(cell.episodes and cell.seeds == [0] for cell in tables.cells)
+    assert all(bool(cell.paper) == (name != "methods") for cell in tables.cells)
+    assert {cell.row for cell in tables.cells if cell.sub_skills_in_use is None} == FLAT & set(ROWS[name])
 
 
 @pytest.fixture
-def sweep(programs, runs: Path, runs_of, mlflow_file: str, joined) -> Callable[[str], tuple[dict, Run, list[Run]]]:
-    """Run one of the project's sweeps at preset smoke; return its tables and its MLflow runs."""
+def sweep(programs, workplace: Path, runs_of, mlflow_file: str, joined) -> Callable[[str], tuple[dict, Run, list[Run]]]:
+    """Run a sweep at preset smoke; return its tables and its MLflow runs."""
 
-    def run(name: str) -> tuple[dict, Run, list[Run]]:
-        code, printed = programs("tune_sweep", name, "--preset", "smoke", "--name", name, "--runs", str(runs))
+    def run(file: str) -> tuple[dict, Run, list[Run]]:
+        code, printed = programs("tune_sweep", file, "--preset", "smoke", "--name", "run")
         assert code == 0, printed
-        folder = runs / name
+        folder = workplace / "runs" / "run"
         tables = json.loads((folder / "tables" / "tables.json").read_text())
         assert set(tables["trials"]) <= {"finished", "stopped"}, printed
         assert tables["what"] in printed
@@ -63,45 +71,59 @@ def sweep(programs, runs: Path, runs_of, mlflow_file: str, joined) -> Callable[[
     return run
 
 
-@pytest.mark.parametrize(
-    "name", [name if name == "em" else pytest.param(name, marks=pytest.mark.thorough) for name in ROWS]
-)
-def test_each_sweep_ends_with_its_table(sweep, mlflow_file: str, name: str) -> None:
-    tables, parent, children = sweep(name)
+def test_a_sweep_ends_with_its_table(sweep, mlflow_file: str) -> None:
+    tables, parent, children = sweep("em")
     artifacts = [found.path for found in MlflowClient(mlflow_file).list_artifacts(parent.info.run_id, "tables")]
     assert {"tables/report.html", "tables/table.png"} <= set(artifacts)
-    assert list(dict.fromkeys(cell["row"] for cell in tables["cells"])) == ROWS[name]
-    assert all(cell["episodes"] and cell["seeds"] == [0] for cell in tables["cells"])
-    assert all(bool(cell["paper"]) == (name != "methods") for cell in tables["cells"])
+    assert list(dict.fromkeys(cell["row"] for cell in tables["cells"])) == ROWS["em"]
+    assert all(cell["episodes"] and cell["seeds"] == [0] and cell["paper"] for cell in tables["cells"])
     assert parent.info.status == "FINISHED"
     assert tables["what"] in parent.data.tags["mlflow.note.content"]
     assert len(children) == sum(tables["trials"].values())
     for child in children:
         assert child.info.status == "FINISHED"
-        assert child.data.tags["sweep"] == name
+        assert child.data.tags["sweep"] == "em"
         assert {"suite", "method", "seed", "variant"} <= child.data.tags.keys()
         assert any("success_rate/" in metric for metric in child.data.metrics)
-        if child.data.tags["method"] not in ("per-task", "nearest-neighbour"):
-            assert "loss" in child.data.metrics
-    online = {cell["row"] for cell in tables["cells"] if cell["environment_steps"]}
-    assert online == {"OptionGAIL"} & set(ROWS[name])
-    flat = {cell["row"] for cell in tables["cells"] if cell["sub_skills_in_use"] is None}
-    assert flat == FLAT & set(ROWS[name])
+        assert "loss" in child.data.metrics
+    assert not any(cell["environment_steps"] for cell in tables["cells"])
+    assert all(cell["sub_skills_in_use"] is not None for cell in tables["cells"])
 
 
 @pytest.mark.thorough
-def test_a_search_stops_the_worse_and_names_the_best(sweep, runs: Path) -> None:
-    tables, _, children = sweep("search")
+def test_one_training_has_a_row_for_each_evaluation_and_counts_its_practice(sweep) -> None:
+    settings = {
+        "what": "a test", "suites": ["ml10"], "seeds": [0], "variants": {"one": {"method": {"name": "option-gail"}}},
+        "evaluations": {"1": {"fine_tuning_steps": 1}, "2": {"fine_tuning_steps": 2}}, "shots": [1],
+        "settings": {"training": {"iterations": 2, "checkpoint_every": 2}, "evaluation": {"episodes": 1}},
+    }  # fmt: skip
+    Path("own.yaml").write_text(yaml.safe_dump(settings))
+    tables, _, (child,) = sweep("own.yaml")
+    assert list(dict.fromkeys(cell["row"] for cell in tables["cells"])) == ["1", "2"]
+    assert all(cell["environment_steps"] for cell in tables["cells"])
+    assert {f"{row}/success_rate/meta-testing/1-shot" for row in "12"} <= child.data.metrics.keys()
+
+
+@pytest.mark.thorough
+def test_a_search_stops_the_worse_and_names_the_best(sweep, workplace: Path) -> None:
+    settings = yaml.safe_load((CONFIGS / "search.yaml").read_text())
+    settings["search"]["space"]["method.hidden_units"] = [8]
+    smoke = settings["presets"]["smoke"]["settings"]
+    smoke["training"] = {"iterations": 4, "checkpoint_every": 2}
+    smoke["evaluation"] = {"every": 2, "episodes": 1, "fine_tuning_steps": 1}
+    Path("own.yaml").write_text(yaml.safe_dump(settings))
+    tables, _, children = sweep("own.yaml")
     assert len(tables["samples"]) == len(children) == 4
     assert tables["samples"][0]["status"] == "finished"
     assert {child.info.status for child in children} == {"FINISHED"}
     assert all(sample["held_out"] is not None for sample in tables["samples"])
-    assert set(yaml.safe_load((runs / "search/tables/best.yaml").read_text())) == {"method", "training"}
+    folder = SweepFolder(workplace / "runs" / "run")
+    assert set(yaml.safe_load((folder.path / "tables/best.yaml").read_text())) == {"method", "training"}
     assert {cell["split"] for cell in tables["cells"]} <= {"meta-training", "meta-testing"}
-    folder = SweepFolder(runs / "search")
     results = [folder.result(name) for name in folder.trials]
-    evaluated = [runs / path / "episodes.jsonl" for result in results if result for path in result.evaluated.values()]
-    tasks = {json.loads(line)["task"] for path in evaluated for line in path.read_text().splitlines()}
+    evaluated = [folder.runs / path for result in results if result for path in result.evaluated.values()]
+    rows = [line for path in evaluated for line in (path / "episodes.jsonl").read_text().splitlines()]
+    tasks = {json.loads(row)["task"] for row in rows}
     assert tasks == {"reach", "drawer-close", "push"}
 
 

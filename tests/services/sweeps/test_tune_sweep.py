@@ -24,12 +24,14 @@ from services.storage.remote import STORAGE
 from services.sweeps.folders import SweepFolder
 from services.tracking.tracker import Tracker
 
+EVALUATION = {"episodes": 1, "fine_tuning_steps": 1}
+
 
 def write_sweep(variants: dict[str, object], **changes: object) -> str:
     """Write a small sweep in the working directory."""
     settings = {
         "what": "a test", "suites": ["ml10"], "seeds": [0], "variants": variants, "shots": [1],
-        "settings": {"training": {"iterations": 40, "checkpoint_every": 5}}, **changes,
+        "settings": {"training": {"iterations": 40, "checkpoint_every": 5}, "evaluation": EVALUATION}, **changes,
     }  # fmt: skip
     Path("small.yaml").write_text(yaml.safe_dump(settings, allow_unicode=True))
     return "small.yaml"
@@ -90,10 +92,10 @@ def test_a_killed_sweep_goes_on_where_it_was(
 
 @pytest.mark.thorough
 @pytest.mark.usefixtures("joined")
-@pytest.mark.usefixtures("joined")
 def test_what_a_sweep_trained_is_fetched_elsewhere(programs, workplace: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv(STORAGE, (tmp_path / "storage").as_uri())
-    file = write_sweep({"DMIL": {}}, settings={"training": {"iterations": 4, "checkpoint_every": 2}})
+    training = {"iterations": 4, "checkpoint_every": 2}
+    file = write_sweep({"DMIL": {}}, settings={"training": training, "evaluation": EVALUATION})
 
     def trained() -> tuple[str, bytes, str]:
         code, printed = programs("tune_sweep", file, "--preset", "smoke", "--name", "once")
