@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import ClassVar
 
 import fsspec
 import numpy as np
@@ -120,18 +119,16 @@ class WithoutNew(MemoryFileSystem):
     """Files in memory, of a library that has no mode for a file that must not be there yet."""
 
     protocol = "without-new"
-    store: ClassVar[dict] = {}
-    pseudo_dirs: ClassVar[list] = [""]
 
-    def _open(self, path, mode="rb", **options):
+    def _open(self, path, mode="rb", block_size=None, autocommit=True, cache_options=None, **kwargs):
         if "x" in mode:
             raise NotImplementedError(mode)
-        return super()._open(path, mode, **options)
+        return super()._open(path, mode, block_size, autocommit, cache_options, **kwargs)
 
 
 def test_a_file_is_made_once_too_where_no_mode_is_for_that():
     fsspec.register_implementation("without-new", WithoutNew, clobber=True)
-    storage = Storage("without-new://lab")
+    storage = Storage("without-new://a-lab")
     assert storage.create("runs/run/claim", b"one", 10) == b"one"
     assert storage.create("runs/run/claim", b"other", 10) == b"one"
 
