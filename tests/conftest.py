@@ -23,8 +23,8 @@ for _name in (
     os.environ.pop(_name, None)
 
 LONGEST = (
-    "test_tune_configs.py", "test_tune_sweep.py", "test_same_bits.py", "test_faults.py", "test_runner.py",
-    "test_programs.py", "test_remote.py", "test_meta_train.py", "test_jobs.py",
+    "test_same_bits.py", "test_tune_sweep.py", "test_tune_configs.py", "test_methods.py", "test_faults.py",
+    "test_runner.py", "test_programs.py", "test_meta_train.py", "test_remote.py", "test_jobs.py",
 )  # fmt: skip
 
 
