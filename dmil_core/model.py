@@ -60,7 +60,8 @@ class Model:
 
         Raises:
             UserError: for what is no demonstration of such a robot.
-            DivergedError: if the policy is of no use.
+            DivergedError: if the policy's actions are not finite, or further from the demonstrated ones, on average,
+                than the action space is wide and than before adaptation.
         """
         usual = self.fine_tuning
         fine_tuning = FineTuning(
@@ -81,7 +82,15 @@ class Model:
                 stacklevel=2,
             )
         policy = method.adapt(self._parameters, support, fine_tuning)
-        _check(policy, support, actions, fine_tuning)
+        if (error := _error(policy, support)) > _width(support, actions):
+            before = _error(method.adapt(self._parameters, support, fine_tuning._replace(steps=0)), support)
+            if error > before or not np.isfinite(error):
+                raise DivergedError(
+                    f"adaptation diverged: got a mean squared error of {error:.3g} on what was demonstrated after "
+                    f"{fine_tuning.steps} steps at a learning rate of {fine_tuning.learning_rate:g}, {before:.3g} "
+                    "before; wanted a smaller one; give fewer steps or a smaller learning_rate, and see that the "
+                    "demonstrations are in the units of meta-training"
+                )
         return AdaptedPolicy(policy, Origin(manifest, self.checkpoint.constants, support, fine_tuning, interface))
 
 
@@ -124,25 +133,18 @@ def _fetched(scheme: str, address: str) -> Checkpoint:
 
 
 @torch.no_grad()
-def _check(policy: Policy, support: Sequence[Demonstration], bounds: Range, fine_tuning: FineTuning) -> None:
-    """See whether a policy does anything like what was demonstrated, in the states of the demonstrations.
-
-    Raises:
-        DivergedError: if a number of it is not finite, or if it is further from the demonstrated actions, on average,
-            than the action space is wide.
-    """
+def _error(policy: Policy, support: Sequence[Demonstration]) -> float:
+    """Return the mean squared distance from the demonstrated actions, in their states; infinite where that is none."""
+    if not all(bool(tensor.isfinite().all()) for tensor in tensors_of(policy).values()):
+        return np.inf
     observations = np.concatenate([one.observations for one in support])
-    wanted = np.concatenate([one.actions for one in support])
-    width = np.maximum(wanted.max(0), bounds.high) - np.minimum(wanted.min(0), bounds.low)
-    got, most = "numbers that are not finite", float(np.square(width).sum())
-    if all(bool(tensor.isfinite().all()) for tensor in tensors_of(policy).values()):
-        actions = policy.act(observations, policy.start(len(observations))).actions
-        error = float(np.square(actions - wanted).sum(1).mean())
-        if error <= most:
-            return
-        got = f"a mean squared error of {error:.3g}, where {most:.3g} is as far as the action space is wide,"
-    raise DivergedError(
-        f"adaptation diverged: got {got} after {fine_tuning.steps} steps at a learning rate of "
-        f"{fine_tuning.learning_rate:g}; wanted a policy near what was demonstrated; give fewer steps or a smaller "
-        "learning_rate, and see that the demonstrations are in the units of meta-training"
-    )
+    actions = policy.act(observations, policy.start(len(observations))).actions
+    error = float(np.square(actions - np.concatenate([one.actions for one in support])).sum(1).mean())
+    return error if np.isfinite(error) else np.inf
+
+
+def _width(support: Sequence[Demonstration], bounds: Range) -> float:
+    """Return the squared distance between the opposite corners of the action space and all that was demonstrated."""
+    actions = np.concatenate([one.actions for one in support])
+    high, low = np.maximum(actions.max(0), np.array(bounds.high)), np.minimum(actions.min(0), np.array(bounds.low))
+    return float(np.square(high - low).sum())

@@ -32,10 +32,10 @@ class Interface:
     def of(cls, manifest: Manifest, method: Method[Any]) -> "Interface":
         """Return what a checkpoint's policies take and give; its manifest names the bounds of actions."""
         assert manifest.actions is not None
-        config, observed = manifest.config, manifest.observed
-        tasks = ", ".join(list(manifest.data)[:5]) + ", ..." * (len(manifest.data) > 5)
+        suite, observed = manifest.config.suite, manifest.observed
+        tasks = f" ({', '.join(suite.train_tasks)})" if suite.train_tasks else ""
         obs_dim = method.obs_dim if observed is None else len(observed)
-        return cls(obs_dim, manifest.actions, observed, f"as {config.suite.name} has it ({tasks})")
+        return cls(obs_dim, manifest.actions, observed, f"as {suite.name} has it{tasks}")
 
     @property
     def action_dim(self) -> int:

@@ -27,6 +27,7 @@ Quiet = Annotated[
 PROGRAMS = {
     "meta-train": "collect demonstrations, meta-train, evaluate",
     "collect-demos": "let the scripted experts make demonstrations",
+    "adapt": "adapt a model to demonstrations of your own, and save the policy",
     "evaluate": "adapt a checkpoint to each task and measure its success rates",
     "tune-sweep": "run an ablation or a search on Ray Tune",
     "doctor": "check a machine or a cluster before a long run",
