@@ -18,7 +18,8 @@ from dmil_core.checksums import listing, sha256
 from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.errors import RunError, UserError, shorten
 from dmil_core.files import create_file, making_folder, room_for
-from dmil_core.methods.base import FineTuning, Policy
+from dmil_core.fine_tuning import FineTuning, Optimiser
+from dmil_core.methods.base import Policy
 from dmil_core.methods.registry import method_type
 from dmil_core.policy_tensors import tensors_of, with_tensors
 from dmil_core.recorded import Interface, numbers
@@ -40,6 +41,8 @@ class Source(BaseModel):
     """Of the checkpoint that was adapted."""
     fine_tuning_steps: Annotated[int, Field(ge=0, lt=2**63)]
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    optimiser: Optimiser = "sgd"
+    displaced: Annotated[int, Field(ge=0)] = 0
     demonstrations: Annotated[tuple[tuple[str, str], ...], Field(min_length=1)]
     """Task and id of each demonstration that it was adapted to."""
     files: dict[str, str] = {}
@@ -166,6 +169,8 @@ class AdaptedPolicy:
             model=origin.model,
             fine_tuning_steps=origin.fine_tuning.steps,
             learning_rate=origin.fine_tuning.learning_rate,
+            optimiser=origin.fine_tuning.optimiser,
+            displaced=origin.fine_tuning.displaced,
             demonstrations=tuple((one.task, one.id) for one in self.support),
             files={name: sha256(content) for name, content in files.items()},
         )
@@ -207,10 +212,11 @@ def load_policy(folder: str | Path) -> AdaptedPolicy:
         )
     except (KeyError, DemonstrationError) as error:
         raise damaged(path / DEMONSTRATIONS, str(error), f"the demonstrations that {POLICY} names") from error
-    settings, fine_tuning = source.model.config.method, FineTuning(source.fine_tuning_steps, source.learning_rate)
-    method = method_type(settings.name).restored(settings, support[0].actions.shape[1], constants)
+    settings, points = source.model.config.method, source.model.config.suite.points
+    fine_tuning = FineTuning(source.fine_tuning_steps, source.learning_rate, source.optimiser, source.displaced)
+    method = method_type(settings.name).restored(settings, support[0].actions.shape[1], constants, points)
     zeros = {name: torch.zeros(shape) for name, shape in source.model.torch_shapes.items()}
-    form = method.adapt(zeros, support, fine_tuning._replace(steps=0))  # whose tensors are then put aside
+    form = method.adapt(zeros, support, fine_tuning._replace(steps=0, displaced=0))  # whose tensors are then put aside
     loaded, wanted = _loaded(tensors), tensors_of(form)
     if {name: (t.shape, t.dtype) for name, t in loaded.items()} != {n: (t.shape, t.dtype) for n, t in wanted.items()}:
         raise damaged(path / TENSORS, f"tensors {shorten(list(loaded))}", f"those of {settings.name}'s policy")

@@ -51,6 +51,14 @@ FILES = {
 """What a checkpoint has besides its marker, and the most bytes of each."""
 
 Model = TypeVar("Model", bound=BaseModel)
+ADDED = {
+    "suite": {"points"},
+    "method": {"features", "absolute_position", "context", "context_share"},
+    "training": {"schedule"},
+    "evaluation": {"optimiser", "displaced"},
+}
+"""Settings that version 0.1 did not have: where they have their defaults, a digest is as it was without them."""
+
 Side = Annotated[int, Field(ge=1, le=MOST_TENSORS)]
 Shape = Annotated[tuple[Side, ...], Field(min_length=1, max_length=8)]
 
@@ -134,9 +142,15 @@ class Manifest(BaseModel):
 
         The SHA-256 of the manifest as canonical JSON, and so of all tensors, settings and data, but without `loss` and
         `mlflow_run_id`: they differ between a run that was disturbed and one that was not, which end alike otherwise.
-        `actions` and `observed` follow from suite and data, and are left out too.
+        `actions` and `observed` follow from suite and data, and are left out too, and so are settings that came later
+        and have their defaults.
         """
         identity = self.model_dump(mode="json", exclude={"loss", "mlflow_run_id", "actions", "observed"})
+        for section, names in ADDED.items():
+            settings = getattr(self.config, section)
+            for name in names & type(settings).model_fields.keys():
+                if getattr(settings, name) == type(settings).model_fields[name].default:
+                    del identity["config"][section][name]
         identity["shapes"] = list(identity["shapes"].items())  # their order is the parameters' order
         return sha256(json.dumps(identity, sort_keys=True, separators=(",", ":")).encode())
 
@@ -189,8 +203,8 @@ class Checkpoint:
 
     def method(self, action_dim: int) -> Method[Any]:
         """Return the method that the parameters are of, for actions of so many numbers."""
-        settings = self.manifest.config.method
-        return method_type(settings.name).restored(settings, action_dim, self.constants)
+        config = self.manifest.config
+        return method_type(config.method.name).restored(config.method, action_dim, self.constants, config.suite.points)
 
     @cached_property
     def actions(self) -> Range:

@@ -5,8 +5,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
+from dmil_core.fine_tuning import FineTuning, Optimiser
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.registry import config_type
+from dmil_core.points import Points
 from dmil_core.settings import Count, MethodConfig, NotNegative, Positive, Seed, Settings, Size
 
 SuiteName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]*$")]
@@ -30,6 +32,9 @@ class SuiteConfig(Settings):
     """Spread of the initial states of a kitchen's episodes: 1 is that of its real demonstrations."""
     horizon: Size | None = None
     """Steps in an episode, in place of the suite's."""
+    points: Points | None = None
+    """Which numbers of an observation are positions, in place of what the suite declares; of use for methods that work
+    with differences of them."""
     train_tasks: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     """Use these meta-training tasks instead of all of the suite's."""
     test_tasks: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
@@ -92,6 +97,8 @@ class TrainingConfig(Settings):
     learning_rate: Positive = 1e-4
     """Outer learning rate β of Adam (Table 9). With outer_step=average: the fraction of the way to the mean of the
     slots' parameters."""
+    schedule: Literal["constant", "cosine"] = "constant"
+    """cosine lets the learning rate fall to a hundredth over the iterations that are set."""
     gradient_clip: Positive | None = None
     """Clip the outer gradient to this norm."""
     checkpoint_every: Count = 200
@@ -113,8 +120,19 @@ class EvaluationConfig(Settings):
     """Steps of adaptation to the support set (E.4)."""
     learning_rate: Positive = 1e-2
     """Learning rate of adaptation (E.4)."""
+    optimiser: Optimiser = "sgd"
+    """sgd takes plain steps on the whole support set, as the inner loop does; adam takes Adam's on batches of 128
+    states, at a rate that falls along a cosine, for methods that fine-tune networks."""
+    displaced: Annotated[int, Field(ge=0, le=10_000)] = 0
+    """Copies of the support set with object and goal displaced, to fine-tune on besides; only where a suite declares
+    points."""
     every: Count | None = None
     """Iterations between evaluations, a multiple of checkpoint_every; none evaluates at the end alone."""
+
+    @property
+    def fine_tuning(self) -> FineTuning:
+        """How to adapt."""
+        return FineTuning(self.fine_tuning_steps, self.learning_rate, self.optimiser, self.displaced)
 
 
 def _method_settings(settings: object) -> object:

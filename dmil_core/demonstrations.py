@@ -2,8 +2,9 @@
 
 import dataclasses
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float32
@@ -79,6 +80,15 @@ class Demonstration(Trajectory, _Named):  # bases in this order: a constructor t
         )
 
 
+class PathBatch(NamedTuple):
+    """Some demonstrations of a task to see, and others to imitate."""
+
+    context: tuple[Demonstration, ...]
+    query: tuple[Demonstration, ...]
+    seed: int
+    """Names what is drawn in learning from them."""
+
+
 @dataclass(frozen=True)
 class TaskBatch:
     """What one task contributes to one outer step: τ1 and τ2 to adapt to, τ3 and τ4 to judge by (Algorithm 1)."""
@@ -88,6 +98,8 @@ class TaskBatch:
     support_low: tuple[Demonstration, ...]
     query_high: tuple[Demonstration, ...]
     query_low: tuple[Demonstration, ...]
+    path: "PathBatch | None" = None
+    """What a path network learns from, if there is one."""
 
     @property
     def sets(self) -> tuple[tuple[Demonstration, ...], ...]:
@@ -130,37 +142,47 @@ def sample_task_batch(
             return demonstration
         return demonstration.window(int(rng.integers(len(demonstration) - window + 1)), window)
 
-    sets = [tuple(cut(demonstrations[index]) for index in row) for row in chosen]
-    return TaskBatch(demonstrations[0].task, *sets)
+    first, second, third, fourth = (tuple(cut(demonstrations[index]) for index in row) for row in chosen)
+    return TaskBatch(demonstrations[0].task, first, second, third, fourth)
+
+
+Features: TypeAlias = Callable[[Float32[np.ndarray, "steps obs_dim"]], Float32[np.ndarray, "steps features"]]
+"""What networks see of observations, in other numbers than theirs."""
 
 
 @dataclass(frozen=True, eq=False)
 class Normalisation:
-    """How observations are brought to zero mean and unit scale before a network sees them."""
+    """How observations, or features of them, are brought to zero mean and unit scale before a network sees them."""
 
-    mean: Float32[np.ndarray, " obs_dim"]
-    scale: Float32[np.ndarray, " obs_dim"]
-
-    @classmethod
-    def identity(cls, obs_dim: int) -> "Normalisation":
-        """Leave observations as they are."""
-        return cls(np.zeros(obs_dim, np.float32), np.ones(obs_dim, np.float32))
+    mean: Float32[np.ndarray, " features"]
+    scale: Float32[np.ndarray, " features"]
+    features: Features | None = None
+    """What mean and scale are of; none: the observations themselves."""
 
     @classmethod
-    def of(cls, demonstrations: Sequence[Demonstration], floor: float = 0.02) -> "Normalisation":
+    def identity(cls, obs_dim: int, features: Features | None = None) -> "Normalisation":
+        """Leave observations, or features of so many numbers, as they are."""
+        return cls(np.zeros(obs_dim, np.float32), np.ones(obs_dim, np.float32), features)
+
+    @classmethod
+    def of(
+        cls, demonstrations: Sequence[Demonstration], floor: float = 0.02, features: Features | None = None
+    ) -> "Normalisation":
         """Take mean and standard deviation over all steps of `demonstrations`.
 
         Args:
             demonstrations: of all meta-training tasks.
             floor: the least scale, in the observation's units: a coordinate that hardly moves in meta-training may
                 move in a new task, and must not then drown all others.
+            features: what networks see of observations, if not those.
         """
-        steps = np.concatenate([demonstration.observations for demonstration in demonstrations]).astype(np.float64)
-        return cls(steps.mean(0).astype(np.float32), np.maximum(steps.std(0), floor).astype(np.float32))
+        observations = np.concatenate([demonstration.observations for demonstration in demonstrations])
+        steps = (observations if features is None else features(observations)).astype(np.float64)
+        return cls(steps.mean(0).astype(np.float32), np.maximum(steps.std(0), floor).astype(np.float32), features)
 
-    def __call__(self, observations: Float32[np.ndarray, "steps obs_dim"]) -> Float32[np.ndarray, "steps obs_dim"]:
-        """Return the standardised observations, a new array."""
-        return (observations - self.mean) / self.scale
+    def __call__(self, observations: Float32[np.ndarray, "steps obs_dim"]) -> Float32[np.ndarray, "steps features"]:
+        """Return the standardised observations, or features, a new array."""
+        return ((observations if self.features is None else self.features(observations)) - self.mean) / self.scale
 
 
 def digest(demonstrations: Sequence[Demonstration]) -> str:

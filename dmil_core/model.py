@@ -40,9 +40,8 @@ class Model:
 
     @property
     def fine_tuning(self) -> FineTuning:
-        """Steps and learning rate of adaptation that the checkpoint's run used, the defaults of `adapt`."""
-        evaluation = self.checkpoint.manifest.config.evaluation
-        return FineTuning(evaluation.fine_tuning_steps, evaluation.learning_rate)
+        """The adaptation that the checkpoint's run used, with the defaults of `adapt`."""
+        return self.checkpoint.manifest.config.evaluation.fine_tuning
 
     def adapt(
         self, demonstrations: Sequence[Any], *, steps: int | None = None, learning_rate: float | None = None
@@ -64,8 +63,9 @@ class Model:
                 than the action space is wide and than before adaptation.
         """
         usual = self.fine_tuning
-        fine_tuning = FineTuning(
-            usual.steps if steps is None else steps, usual.learning_rate if learning_rate is None else learning_rate
+        fine_tuning = usual._replace(
+            steps=usual.steps if steps is None else steps,
+            learning_rate=usual.learning_rate if learning_rate is None else learning_rate,
         )
         if fine_tuning.steps < 0 or not 0 < fine_tuning.learning_rate < np.inf:
             raise UserError(f"adapt: got {fine_tuning}; wanted steps of at least 0 and a learning_rate above 0")

@@ -1,5 +1,6 @@
 """The outer loop of Algorithm 1: which task sits in which slot, a group's gradient, and the step of Adam."""
 
+import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
@@ -19,6 +20,10 @@ from dmil_core.trajectories import Rollout
 
 BLOCKS_PER_WORKER = 4
 """Blocks that each worker should find at least, so that a slow one takes fewer and the others do not wait."""
+
+
+LAST_RATE = 0.01
+"""The last learning rate of a cosine schedule, as a part of the first."""
 
 
 CollectRollouts: TypeAlias = Callable[[Policy, str, int, int], Sequence[Rollout]]
@@ -186,11 +191,21 @@ class OuterStep:
         norm = torch.nn.utils.clip_grad_norm_([self._parameters], limit)
         if norm.isfinite():
             if training.outer_step == "adam":
+                self._adam.param_groups[0]["lr"] = self._learning_rate
                 self._adam.step()
             else:
                 self.parameters.sub_(total, alpha=training.learning_rate)
                 self.skip()
         return norm.item()
+
+    @property
+    def _learning_rate(self) -> float:
+        """Of the next step."""
+        training, done = self._training, int(self._adam.state[self._parameters]["step"])
+        if training.schedule == "constant":
+            return training.learning_rate
+        along = 0.5 * (1 + math.cos(math.pi * min(done / training.iterations, 1)))
+        return training.learning_rate * (LAST_RATE + (1 - LAST_RATE) * along)
 
     def skip(self) -> None:
         """Count an iteration without a step of Adam; parameters and moments stay."""

@@ -1,7 +1,7 @@
 """Bounds of settings, and the bases of a method's own settings."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -27,11 +27,20 @@ class MethodConfig(Settings):
     """The method."""
     standardise: bool = True
     """Normalise observations by mean and standard deviation of the meta-training demonstrations."""
+    features: Literal["raw", "relative"] = "raw"
+    """What networks see of an observation: its numbers, or differences of the points that the suite declares."""
+    absolute_position: bool = False
+    """Whether relative features hold the hand's own position too."""
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     """Settings of the method's own, by section, in each of the presets paper, quick and smoke."""
     bound_of_shots: ClassVar[str | None] = None
     """Name of the setting that limits the demonstrations of a support set, if there is a limit."""
+
+    @property
+    def uses_points(self) -> bool:
+        """Whether it works with the points that a suite declares."""
+        return self.features == "relative"
 
 
 class NetworkConfig(MethodConfig):
@@ -62,6 +71,21 @@ class WindowConfig(MethodConfig):
     """Trajectories in each of τ1 to τ4 (Table 9)."""
     window: Count | None = None
     """Cut each trajectory to this many steps from a random step on; none uses it whole."""
+
+
+class ContextConfig(MethodConfig):
+    """Base of the settings of a method whose policy may see its demonstrations while it acts."""
+
+    context: Literal["none", "path"] = "none"
+    """path: a second network sees where the demonstrated hand goes next, from the nearest support state; it is
+    meta-trained beside the others, and its action is part of the policy's."""
+    context_share: Annotated[float, Field(ge=0, le=1)] = 0.5
+    """Part that the path network has in the action, where there is one."""
+
+    @property
+    def uses_points(self) -> bool:
+        """Whether it works with the points that a suite declares."""
+        return super().uses_points or self.context == "path"
 
 
 class HierarchicalConfig(MethodConfig):

@@ -57,7 +57,7 @@ class Arguments:
     """The suite, as ml10, ml45, ML1-reach, push-around-wall or kitchen; short for --suite.name."""
     method: str | None = None
     """The method: dmil, option-gail, option-gail-offline, mil, mlsh, pemirl, behaviour-cloning, per-task,
-    nearest-neighbour, or what an installed package brings; its settings are then those of --method.… below."""
+    nearest-neighbour, tracking, or what an installed package brings; its settings are those of --method.… below."""
     demos: str | None = None
     """Where demonstrations come from, as minari:ID,TASK=ID; short for --demonstrations.source."""
     config: Path | None = None

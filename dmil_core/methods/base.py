@@ -21,7 +21,13 @@ from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 
 from dmil_core.demonstrations import Demonstration, Normalisation
+from dmil_core.errors import UserError
+from dmil_core.features import RelativeFeatures
+from dmil_core.fine_tuning import FineTuning as FineTuning
+from dmil_core.losses import Steps
 from dmil_core.networks import Parameters
+from dmil_core.paths import with_copies
+from dmil_core.points import Points
 from dmil_core.settings import MethodConfig
 from dmil_core.trajectories import Rollout
 
@@ -81,11 +87,24 @@ class NormalisedPolicy(Policy):
         return Decision(actions.numpy(), np.zeros(len(observations), np.int64), memory)
 
 
-class FineTuning(NamedTuple):
-    """Gradient steps of adaptation at test; a method without any ignores it."""
+OBSERVATION_FLOOR, FEATURE_FLOOR = 0.02, 0.05
+"""The least scale of a number in an observation, and of a feature."""
 
-    steps: int
-    learning_rate: float
+
+def features_of(config: MethodConfig, points: Points | None) -> RelativeFeatures | None:
+    """Return what turns observations into features, if it is not they that networks see.
+
+    Raises:
+        UserError: for relative features without an object among the points.
+    """
+    if config.features == "raw":
+        return None
+    if points is None or points.object is None:
+        raise UserError(
+            "method.features: got relative for a suite that declares no object; wanted suite.points with hand and "
+            "object, see docs/your-own-task.md; or --method.features raw"
+        )
+    return RelativeFeatures(points, config.absolute_position)
 
 
 Config = TypeVar("Config", bound=MethodConfig)
@@ -99,34 +118,68 @@ class Method(ABC, Generic[Config]):
     config: Config
     action_dim: int
     normalise: Normalisation
+    points: Points | None = None
+    """What the suite declares of observations; none where the method does not use it."""
 
     config_type: ClassVar[type[MethodConfig]]
     """Class of the settings, whose default name is the method's."""
 
     @classmethod
-    def prepared(cls: type[M], config: Config, action_dim: int, demonstrations: Sequence[Demonstration]) -> M:
-        """Return the method with the observation statistics of all meta-training demonstrations."""
+    def prepared(
+        cls: type[M],
+        config: Config,
+        action_dim: int,
+        demonstrations: Sequence[Demonstration],
+        points: Points | None = None,
+    ) -> M:
+        """Return the method with the statistics of observations, or features, in all meta-training demonstrations.
+
+        Raises:
+            UserError: for relative features without declared points, or points that there are not.
+        """
+        features = features_of(config, points)
+        observations = demonstrations[0].observations
+        if points is not None:
+            points.check(observations.shape[1], action_dim)
+        seen = observations if features is None else features(observations)
         if config.standardise:
-            return cls(config, action_dim, Normalisation.of(demonstrations))
-        return cls(config, action_dim, Normalisation.identity(demonstrations[0].observations.shape[1]))
+            floor = OBSERVATION_FLOOR if features is None else FEATURE_FLOOR
+            return cls(config, action_dim, Normalisation.of(demonstrations, floor, features), points)
+        return cls(config, action_dim, Normalisation.identity(seen.shape[1], features), points)
 
     @classmethod
-    def restored(cls: type[M], config: Config, action_dim: int, constants: Mapping[str, np.ndarray]) -> M:
+    def restored(
+        cls: type[M],
+        config: Config,
+        action_dim: int,
+        constants: Mapping[str, np.ndarray],
+        points: Points | None = None,
+    ) -> M:
         """Return the method whose `constants` were stored."""
-        return cls(config, action_dim, Normalisation(constants["observation_mean"], constants["observation_scale"]))
+        mean, scale = constants["observation_mean"], constants["observation_scale"]
+        return cls(config, action_dim, Normalisation(mean, scale, features_of(config, points)), points)
 
     def constants(self) -> Mapping[str, np.ndarray]:
         """Return the observation statistics, to be stored beside the parameters."""
         return {"observation_mean": self.normalise.mean, "observation_scale": self.normalise.scale}
 
     @property
-    def obs_dim(self) -> int:
-        """Size of an observation."""
+    def input_dim(self) -> int:
+        """Numbers that a network sees of an observation."""
         return len(self.normalise.mean)
+
+    @property
+    def obs_dim(self) -> int:
+        """Numbers in an observation."""
+        return self.input_dim if self.normalise.features is None or self.points is None else self.points.size
 
     @abstractmethod
     def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the initial parameters, which may be none."""
+
+    def practice(self, support: Sequence[Demonstration], fine_tuning: FineTuning) -> Steps:
+        """Return the steps to fine-tune on: the support set, with displaced copies if there are to be any."""
+        return Steps.of(with_copies(support, self.points, fine_tuning.displaced), self.normalise)
 
     @abstractmethod
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> Policy:

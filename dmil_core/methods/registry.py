@@ -12,6 +12,7 @@ from dmil_core.methods.nearest_neighbour.method import NearestNeighbour
 from dmil_core.methods.option_gail.method import OptionGail, OptionGailOffline
 from dmil_core.methods.pemirl.method import Pemirl
 from dmil_core.methods.per_task.method import PerTask
+from dmil_core.methods.tracking.method import Tracking
 from dmil_core.plug_ins import imported, plug_ins
 from dmil_core.settings import MethodConfig
 
@@ -27,6 +28,7 @@ OURS: dict[str, type[Method[Any]]] = {
     "behaviour-cloning": BehaviourCloning,
     "per-task": PerTask,
     "nearest-neighbour": NearestNeighbour,
+    "tracking": Tracking,
 }
 GUIDE = "docs/your-own-method.md"
 

@@ -54,7 +54,14 @@ def parse(program: type[T], description: str, arguments: Sequence[str], defaults
     """
     module = program.__module__ if program.__module__ != "__main__" else f"services.{Path(sys.argv[0]).stem}"
     try:
-        return tyro.cli(program, prog=f"python -m {module}", args=arguments, description=description, default=defaults)
+        return tyro.cli(
+            program,
+            config=(tyro.conf.AvoidSubcommands,),
+            prog=f"python -m {module}",
+            args=arguments,
+            description=description,
+            default=defaults,
+        )
     except ValidationError as error:
         raise UserError(describe_errors(error)) from error
 

@@ -136,6 +136,8 @@ class Evaluator:
             "versions": library_versions(),
             "fine_tuning_steps": settings.fine_tuning_steps,
             "learning_rate": settings.learning_rate,
+            "optimiser": settings.optimiser,
+            "displaced": settings.displaced,
             "split": adaptation.split,
             "task": adaptation.task,
             "shots": adaptation.shots,

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dmil_core.errors import UserError, describe_errors
 from dmil_core.files import read_file, write_file
+from dmil_core.fine_tuning import Optimiser
 from services.suites.base import Split
 
 Row = TypeVar("Row", bound=BaseModel)
@@ -37,6 +38,9 @@ class _Row(BaseModel):
     """SHA-256 of the task's demonstrations."""
     fine_tuning_steps: int
     learning_rate: float
+    optimiser: Optimiser = "sgd"
+    displaced: int = 0
+    """Displaced copies of the support set."""
     versions: dict[str, str]
 
 
@@ -85,7 +89,7 @@ def write_rows(path: Path, rows: Iterable[BaseModel]) -> None:
     Raises:
         DiskFullError: for want of space; the file is then what it was.
     """
-    write_file(path.parent, path.name, "".join(row.model_dump_json() + "\n" for row in rows))
+    write_file(path.parent, path.name, "".join(row.model_dump_json(exclude_defaults=True) + "\n" for row in rows))
 
 
 def read_rows(path: Path, model: type[Row]) -> list[Row]:

@@ -28,7 +28,7 @@ from services.experiments.meta_training import CheckpointWriter, IterationLog, m
 from services.rollouts.adaptations import AdaptationOutcome
 from services.storage.checkpoints import Checkpoints
 from services.storage.provenance import library_versions
-from services.suites.base import Split, TaskSuite, action_space_of
+from services.suites.base import Split, TaskSuite, action_space_of, with_points
 from services.suites.registry import open_suite
 from services.tracking.tracker import Tracker
 
@@ -49,8 +49,8 @@ class Experiment:
         kind = method_type(name)
         if iterations and not issubclass(kind, MetaLearner):
             raise UserError(f"training.iterations: got {iterations}; wanted 0: {name} has no meta-training")
-        self.config = config
         self.suite: TaskSuite = open_suite(config.suite)
+        self.config = config = with_points(config, self.suite)
         self.store = store
         self._collection = DemonstrationCollection(config, self.suite, store)
 
@@ -88,7 +88,8 @@ class Experiment:
     def method(self, training_sets: Mapping[str, Sequence[Demonstration]]) -> Method[Any]:
         """Return the method, with what it learns once from the training demonstrations."""
         settings, demonstrations = self.config.method, [d for task in training_sets.values() for d in task]
-        return method_type(settings.name).prepared(settings, self.suite.action_dim, demonstrations)
+        kind, points = method_type(settings.name), self.config.suite.points
+        return kind.prepared(settings, self.suite.action_dim, demonstrations, points)
 
     def initial_parameters(self, method: Method) -> Parameters:
         """Draw the parameters that meta-training starts from."""

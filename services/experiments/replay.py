@@ -110,7 +110,7 @@ class Replay:
                 f"{row.checkpoint[:12]}; evaluate the run's end: dmil meta-train --resume {run.folder}"
             )
         method = checkpoint.method(run.experiment.suite.action_dim)
-        fine_tuning = FineTuning(row.fine_tuning_steps, row.learning_rate)
+        fine_tuning = FineTuning(row.fine_tuning_steps, row.learning_rate, row.optimiser, row.displaced)
         return method.adapt(checkpoint.tensors(), self._support(row), fine_tuning)
 
     def _support(self, row: EpisodeResult) -> Sequence[Demonstration]:

@@ -8,7 +8,7 @@ import torch
 
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import UserError
-from dmil_core.methods.base import FineTuning, Policy
+from dmil_core.methods.base import Policy
 from dmil_core.settings import sub_skills_of
 from services.distributed.runner import LocalRunner
 from services.experiments.experiment import Experiment
@@ -102,7 +102,7 @@ def policy_after(run: FinishedRun, support: Sequence[Demonstration], steps: int)
     """Return a run's policy for a support set after some fine-tuning steps of its newest checkpoint."""
     method = run.checkpoint.method(run.experiment.suite.action_dim)
     parameters = {name: torch.from_numpy(array) for name, array in run.checkpoint.parameters.items()}
-    return method.adapt(parameters, support, FineTuning(steps, run.config.evaluation.learning_rate))
+    return method.adapt(parameters, support, run.config.evaluation.fine_tuning._replace(steps=steps))
 
 
 def policies(run: FinishedRun, support: Sequence[Demonstration]) -> dict[str, Policy]:

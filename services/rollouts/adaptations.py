@@ -8,7 +8,7 @@ import numpy as np
 
 from dmil_core.configs import EvaluationConfig
 from dmil_core.demonstrations import Demonstration
-from dmil_core.methods.base import FineTuning, Method, Policy, SubSkillUse
+from dmil_core.methods.base import Method, Policy, SubSkillUse
 from dmil_core.networks import Parameters
 from dmil_core.seeding import named_seed
 from dmil_core.trajectories import Rollout
@@ -119,7 +119,7 @@ def evaluate_adaptation(
             and methods meet the same episodes.
     """
     support = adaptation.support(held_out)
-    policy = method.adapt(parameters, support, FineTuning(evaluation.fine_tuning_steps, evaluation.learning_rate))
+    policy = method.adapt(parameters, support, evaluation.fine_tuning)
     seeds = [named_seed(seed, "evaluation", adaptation.task, episode) for episode in adaptation.episodes]
     others = [demonstration for demonstration in held_out if demonstration not in support]
     episodes = [EpisodeOutcome.of(episode) for episode in rollout(policy, envs, seeds, horizon)]
@@ -144,6 +144,6 @@ def imitation_errors(
 ) -> ImitationErrors:
     """Adapt to a support set and compare the policy with demonstrations: no episodes, else as `evaluate_adaptation`."""
     support = adaptation.support(held_out)
-    policy = method.adapt(parameters, support, FineTuning(evaluation.fine_tuning_steps, evaluation.learning_rate))
+    policy = method.adapt(parameters, support, evaluation.fine_tuning)
     others = [demonstration for demonstration in held_out if demonstration not in support]
     return ImitationErrors(imitation_error(policy, support), imitation_error(policy, others) if others else None)

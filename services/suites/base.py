@@ -7,7 +7,9 @@ import numpy as np
 from gymnasium.spaces import Box
 from jaxtyping import Float32, Float64
 
+from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import UserError
+from dmil_core.points import Points
 
 Environment = gymnasium.Env[np.ndarray, np.ndarray]
 """A task's environment, with a flat observation and actions in a `Box`. ``reset(seed=n)`` twice gives the same episode
@@ -43,6 +45,7 @@ class TaskSuite(Protocol):
 
     Besides what is listed, a suite may have:
 
+    - ``points``: the `Points` of its observations, for features and methods that work with differences of positions;
     - ``state_of(recorded)``: the observations (steps, `obs_dim`) in recorded ones (steps, any dimensions), for data
       sets that hold more, or another form;
     - ``replay(demonstration)``: what its actions lead to, in words;
@@ -76,6 +79,15 @@ class TaskSuite(Protocol):
     def expert(self, task: str) -> Expert | None:
         """Return a task's scripted expert, if there is one."""
         ...
+
+
+def with_points(config: ExperimentConfig, suite: TaskSuite) -> ExperimentConfig:
+    """Return the settings with the points that the suite declares, where any are used and none are given."""
+    declared: Points | None = getattr(suite, "points", None)
+    used = config.method.uses_points or config.evaluation.displaced
+    if declared is None or not used or config.suite.points is not None:
+        return config
+    return config.model_copy(update={"suite": config.suite.model_copy(update={"points": declared})})
 
 
 def measure_of(suite: TaskSuite, task: str) -> Measure | None:

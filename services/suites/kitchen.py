@@ -16,6 +16,7 @@ from jaxtyping import Float32, Float64
 from dmil_core.configs import SuiteConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.errors import UserError
+from dmil_core.points import Points
 from services.suites.base import Environment, Expert
 from services.suites.kitchen_expert import KitchenExpert, kitchen_model
 from services.suites.rendering import View
@@ -159,6 +160,7 @@ class KitchenSuite:
     camera = View((-0.2, 0.5, 2.0), distance=2.2, azimuth=70, elevation=-35)
     obs_dim = 30
     action_dim = 9
+    points = Points(size=30, hand=tuple(range(9)), reach=0.16)
     action_space = Box(-1, 1, (9,))
 
     def __init__(self, config: SuiteConfig) -> None:

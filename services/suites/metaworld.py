@@ -12,6 +12,7 @@ from metaworld.policies import ENV_POLICY_MAP
 
 from dmil_core.configs import SuiteConfig
 from dmil_core.errors import UserError
+from dmil_core.points import Points
 from services.suites.base import Environment, Expert, Measure
 from services.suites.metaworld_speed import fast_environment
 from services.suites.push_around_wall import PushAroundWallEnv, PushAroundWallExpert
@@ -106,6 +107,10 @@ class MetaWorldSuite:
     action_dim = 4
     action_space = Box(-1, 1, (4,))
     best_score = 1
+    points = Points(
+        size=39, hand=(0, 1, 2), gripper=3, object=(4, 5, 6), orientation=(7, 8, 9, 10), second_object=(11, 12, 13),
+        second_orientation=(14, 15, 16, 17), previous=18, goal=(36, 37, 38), reach=0.01,
+    )  # fmt: skip
 
     def __init__(self, config: SuiteConfig) -> None:
         """Check the names of suite and tasks.

@@ -53,9 +53,10 @@ class Imitator(PythonModel):
             RunError: where adaptation has diverged.
         """
         settings = params or {}
-        fine_tuning = FineTuning(
-            int(settings.get("fine_tuning_steps", self._evaluation.fine_tuning_steps)),
-            float(settings.get("learning_rate", self._evaluation.learning_rate)),
+        usual = self._evaluation.fine_tuning
+        fine_tuning = usual._replace(
+            steps=int(settings.get("fine_tuning_steps", usual.steps)),
+            learning_rate=float(settings.get("learning_rate", usual.learning_rate)),
         )
         return [self.answer(row, fine_tuning) for row in model_input.to_dict("records")]
 

@@ -11,6 +11,7 @@ import torch
 
 import dmil_core as dmil
 from dmil_core.checkpoint import Range
+from dmil_core.fine_tuning import FineTuning
 from tests.dmil_core.old_models import FOLDER, METHODS, old_model, recorded
 
 
@@ -50,7 +51,7 @@ def test_an_observation_after_the_last_action_is_left_out():
 
 def test_more_steps_come_nearer_to_what_was_demonstrated():
     model = old_model()
-    assert model.fine_tuning == (5, 0.01)
+    assert model.fine_tuning == FineTuning(5, 0.01)
     (observations, actions), *_ = recorded(model)
 
     def error(steps: int) -> float:

@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from dmil_core.settings import QUICK_NETWORK, SMOKE_NETWORK, NetworkConfig, WindowConfig
+from dmil_core.settings import QUICK_NETWORK, SMOKE_NETWORK, ContextConfig, NetworkConfig, WindowConfig
 
 
-class BehaviourCloningConfig(NetworkConfig, WindowConfig):
+class BehaviourCloningConfig(NetworkConfig, WindowConfig, ContextConfig):
     """Behaviour cloning on all meta-training tasks, fine-tuned on the support set."""
 
     name: Literal["behaviour-cloning"] = "behaviour-cloning"

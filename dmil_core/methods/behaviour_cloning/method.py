@@ -11,6 +11,7 @@ from dmil_core.losses import Steps, behaviour_cloning_loss
 from dmil_core.methods.base import FineTuning, MetaLearner, TaskGradient
 from dmil_core.methods.behaviour_cloning.config import BehaviourCloningConfig
 from dmil_core.methods.behaviour_cloning.policy import NetworkPolicy, fine_tuned, initial_network
+from dmil_core.methods.path_context import guide_of, initial_path_network, with_path, with_path_gradient
 from dmil_core.networks import Parameters, network, zeros_like
 
 
@@ -21,11 +22,15 @@ class BehaviourCloning(MetaLearner[BehaviourCloningConfig, TaskBatch]):
 
     def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the network."""
-        return initial_network(self.config, self.obs_dim, self.action_dim, rng)
+        return {
+            **initial_network(self.config, self.input_dim, self.action_dim, rng),
+            **initial_path_network(self, rng),
+        }
 
     def sample(self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator) -> TaskBatch:
         """Draw what DMIL would draw."""
-        return sample_task_batch(demonstrations, self.config.trajectories, self.config.window, rng)
+        batch = sample_task_batch(demonstrations, self.config.trajectories, self.config.window, rng)
+        return with_path(self, batch, demonstrations, rng)
 
     def task_gradient(self, parameters: Parameters, batch: TaskBatch) -> TaskGradient:
         """Return ∇ L_BC on the whole batch."""
@@ -35,11 +40,11 @@ class BehaviourCloning(MetaLearner[BehaviourCloningConfig, TaskBatch]):
         )
         gradient, views = zeros_like(parameters)
         of_policy.add_to(network(views, "policy"))
-        return TaskGradient(gradient, {"loss": of_policy.loss.value.item()})
+        result = TaskGradient(gradient, {"loss": of_policy.loss.value.item()})
+        return with_path_gradient(self, result, parameters, batch)
 
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> NetworkPolicy:
-        """Take plain gradient steps on the support set, as DMIL's inner loop does."""
-        steps = Steps.of(support, self.normalise)
-        return NetworkPolicy(
-            fine_tuned(network(parameters, "policy"), steps, torch.optim.SGD, fine_tuning), self.normalise
-        )
+        """Take plain gradient steps on the support set, as DMIL's inner loop does, or Adam's on batches."""
+        steps = self.practice(support, fine_tuning)
+        adapted = fine_tuned(network(parameters, "policy"), steps, torch.optim.SGD, fine_tuning)
+        return NetworkPolicy(adapted, self.normalise, guide_of(self, parameters, support))

@@ -7,9 +7,11 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn import functional
 
+from dmil_core.fine_tuning import FineTuning, fixed, free, mean_error, on_batches
 from dmil_core.loss_gradients import LossGradient, loss_gradient
-from dmil_core.losses import Steps, behaviour_cloning_loss, squared_errors
+from dmil_core.losses import Steps, bank_errors, behaviour_cloning_loss, squared_errors, sub_skill_labels
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.dmil.losses import Targets, high_level_loss, targets_of
 from dmil_core.networks import Network, Parameters, bank, mlp, network, own_states, routed, stacked, without_graph
@@ -123,3 +125,30 @@ def adapt(
     for step in itertools.islice(inner_loop(hierarchy, support_high, support_low, config), steps):
         hierarchy = step.adapted
     return hierarchy
+
+
+def adapt_by_adam(hierarchy: Hierarchy, steps: Steps, config: DmilConfig, tuning: FineTuning) -> Hierarchy:
+    """Return the networks after steps of Adam down both levels' losses on batches of states.
+
+    On each batch the labels and the choice are those of the networks as they are; there is no continuity loss, for the
+    states of a batch do not follow each other.
+    """
+    high, low = free(hierarchy.high), tuple(map(free, hierarchy.low))
+
+    def loss(batch: Steps) -> Float[Tensor, ""]:
+        logits = mlp(high, batch.states)
+        chosen, terms = own_states(logits.argmax(-1), len(low)), []
+        if config.adapted != "low" and len(low) > 1:
+            with torch.no_grad():
+                labels = sub_skill_labels(bank_errors(low, batch))
+            terms.append(functional.cross_entropy(logits, labels))
+        if config.adapted != "high":
+            terms += [
+                mean_error(mlp(low[k], batch.states[index]), batch.actions[index])
+                for k, index in enumerate(chosen)
+                if len(index)
+            ]
+        return torch.stack(terms).sum()
+
+    on_batches([high, *low], loss, steps, tuning)
+    return Hierarchy(fixed(high), tuple(map(fixed, low)))

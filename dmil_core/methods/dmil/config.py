@@ -6,6 +6,7 @@ from typing import Any, ClassVar, Literal
 from dmil_core.settings import (
     QUICK_NETWORK,
     SMOKE_NETWORK,
+    ContextConfig,
     HierarchicalConfig,
     NetworkConfig,
     NotNegative,
@@ -15,7 +16,7 @@ from dmil_core.settings import (
 )
 
 
-class DmilConfig(HierarchicalConfig, NetworkConfig, WindowConfig):
+class DmilConfig(HierarchicalConfig, NetworkConfig, WindowConfig, ContextConfig):
     """Dual Meta Imitation Learning."""
 
     name: Literal["dmil"] = "dmil"

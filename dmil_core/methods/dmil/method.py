@@ -12,6 +12,7 @@ from dmil_core.methods.dmil import adaptation, meta_gradient
 from dmil_core.methods.dmil.adaptation import Hierarchy
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.dmil.policy import DmilPolicy
+from dmil_core.methods.path_context import guide_of, initial_path_network, with_path, with_path_gradient
 from dmil_core.networks import Parameters, initialise
 
 
@@ -24,25 +25,33 @@ class Dmil(MetaLearner[DmilConfig, TaskBatch]):
     def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the high level and the bank of sub-skills."""
         hidden, k, scale = self.config.hidden, self.config.sub_skills, self.config.output_scale
-        return {
-            **initialise("high", [self.obs_dim, *hidden, k], rng, output_scale=scale),
-            **initialise("low", [self.obs_dim, *hidden, self.action_dim], rng, copies=k, output_scale=scale),
+        levels = {
+            **initialise("high", [self.input_dim, *hidden, k], rng, output_scale=scale),
+            **initialise("low", [self.input_dim, *hidden, self.action_dim], rng, copies=k, output_scale=scale),
         }
+        return {**levels, **initial_path_network(self, rng)}
 
     def sample(self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator) -> TaskBatch:
         """Draw τ1 to τ4."""
-        return sample_task_batch(demonstrations, self.config.trajectories, self.config.window, rng)
+        batch = sample_task_batch(demonstrations, self.config.trajectories, self.config.window, rng)
+        return with_path(self, batch, demonstrations, rng)
 
     def task_gradient(self, parameters: Parameters, batch: TaskBatch) -> TaskGradient:
         """Return the outer gradient of Algorithm 1 for one task."""
         support_high, support_low, query_high, query_low = (
             Steps.of(demonstrations, self.normalise) for demonstrations in batch.sets
         )
-        return meta_gradient.task_gradient(parameters, support_high, support_low, query_high, query_low, self.config)
+        gradient = meta_gradient.task_gradient(
+            parameters, support_high, support_low, query_high, query_low, self.config
+        )
+        return with_path_gradient(self, gradient, parameters, batch)
 
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> DmilPolicy:
-        """Run the dual inner loop with the support set as both τ1 and τ2."""
-        steps = Steps.of(support, self.normalise)
-        config = self.config.model_copy(update={"inner_learning_rate": fine_tuning.learning_rate})
-        adapted = adaptation.adapt(Hierarchy.of(parameters), steps, steps, config, steps=fine_tuning.steps)
-        return DmilPolicy(adapted, self.normalise)
+        """Run the dual inner loop with the support set as both τ1 and τ2, or both levels' losses down by Adam."""
+        steps, hierarchy = self.practice(support, fine_tuning), Hierarchy.of(parameters)
+        if fine_tuning.optimiser == "adam":
+            adapted = adaptation.adapt_by_adam(hierarchy, steps, self.config, fine_tuning)
+        else:
+            config = self.config.model_copy(update={"inner_learning_rate": fine_tuning.learning_rate})
+            adapted = adaptation.adapt(hierarchy, steps, steps, config, steps=fine_tuning.steps)
+        return DmilPolicy(adapted, self.normalise, guide_of(self, parameters, support))

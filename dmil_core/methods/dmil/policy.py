@@ -11,6 +11,7 @@ from dmil_core.losses import Steps, bank_errors, sub_skill_labels
 from dmil_core.methods.base import Decision, Policy, SubSkillUse
 from dmil_core.methods.dmil import adaptation
 from dmil_core.methods.dmil.adaptation import Hierarchy
+from dmil_core.methods.path_context import PathGuide
 
 
 @dataclass(frozen=True)
@@ -19,12 +20,16 @@ class DmilPolicy(Policy):
 
     hierarchy: Hierarchy
     normalise: Normalisation
+    guide: PathGuide | None = None
+    """What sees the demonstrations while the policy acts, if anything does."""
 
     def act(
         self, observations: Float32[np.ndarray, "episodes obs_dim"], memory: Int64[np.ndarray, "episodes 0"]
     ) -> Decision:
         """Choose one action and its sub-skill for each episode."""
         actions, chosen = adaptation.act(self.hierarchy, torch.from_numpy(self.normalise(observations)))
+        if self.guide is not None:
+            actions = self.guide.blend(actions, observations)
         return Decision(actions.numpy(), chosen.numpy(), memory)
 
     def sub_skill_use(self, demonstration: Demonstration) -> SubSkillUse:

@@ -43,7 +43,7 @@ class Mil(MetaLearner[MilConfig, MilBatch]):
 
     def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the transformer."""
-        return transformer.initialise(self.config, self.obs_dim, self.action_dim, rng)
+        return transformer.initialise(self.config, self.input_dim, self.action_dim, rng)
 
     def sample(self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator) -> MilBatch:
         """Draw one to `shots` demonstrations as the support set, and query pairs from all others.

@@ -38,7 +38,7 @@ class Mlsh(MetaLearner[MlshConfig, DemonstrationBatch]):
     def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the bank of sub-skills; each one's last output is its value."""
         config = self.config
-        sizes = [self.obs_dim, *config.hidden, self.action_dim + 1]
+        sizes = [self.input_dim, *config.hidden, self.action_dim + 1]
         return initialise("low", sizes, rng, copies=config.sub_skills, output_scale=config.output_scale)
 
     def sample(
@@ -89,7 +89,7 @@ class Mlsh(MetaLearner[MlshConfig, DemonstrationBatch]):
     def _fresh_high(self, random: np.random.Generator, learning_rate: float) -> Learner:
         """Draw a high level; its last output is its value."""
         config = self.config
-        sizes = [self.obs_dim, *config.hidden, config.sub_skills + 1]
+        sizes = [self.input_dim, *config.hidden, config.sub_skills + 1]
         return Learner(initialise("high", sizes, random, output_scale=FRESH_SCALE), learning_rate)
 
     def _mode(self, high: Learner, steps: Steps) -> Int[Tensor, " steps"]:

@@ -61,8 +61,8 @@ class _Options(MetaLearner[Any, OptionBatch]):
         """Draw the option model: σ = 1."""
         hidden, k, scale = self.config.hidden, self.config.sub_skills, self.config.output_scale
         return {
-            **initialise("high", [self.obs_dim, *hidden, (k + 1) * k], rng, output_scale=scale),
-            **initialise("low", [self.obs_dim, *hidden, self.action_dim], rng, copies=k, output_scale=scale),
+            **initialise("high", [self.input_dim, *hidden, (k + 1) * k], rng, output_scale=scale),
+            **initialise("low", [self.input_dim, *hidden, self.action_dim], rng, copies=k, output_scale=scale),
             "log_deviations": torch.zeros(k, self.action_dim),
         }
 
@@ -133,8 +133,8 @@ class OptionGail(_Options, OnlineMetaLearner[Any, OptionBatch]):
         k, critic, units = self.config.sub_skills, self.config.critic_units, self.config.discriminator_units
         return {
             **super().initial_parameters(rng),
-            **orthogonal("critic", [self.obs_dim, critic, critic, k], rng),
-            **orthogonal("discriminator", [self.obs_dim + self.action_dim, units, units, (k + 1) * k], rng),
+            **orthogonal("critic", [self.input_dim, critic, critic, k], rng),
+            **orthogonal("discriminator", [self.input_dim + self.action_dim, units, units, (k + 1) * k], rng),
         }
 
     def environment_steps(self, iteration: int) -> int:

@@ -43,7 +43,7 @@ class Pemirl(MetaLearner[PemirlConfig, ContextBatch]):
         of_policy, of_reward = (
             [config.hidden_units] * layers for layers in (config.hidden_layers, config.reward_layers)
         )
-        with_action, with_context = self.obs_dim + self.action_dim, self.obs_dim + config.context_dim
+        with_action, with_context = self.input_dim + self.action_dim, self.input_dim + config.context_dim
         sizes = {
             "encoder": [with_action, *of_policy, 2 * config.context_dim],
             "policy": [with_context, *of_policy, self.action_dim],
@@ -102,6 +102,6 @@ class Pemirl(MetaLearner[PemirlConfig, ContextBatch]):
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> NetworkPolicy:
         """Infer m; its part of the first layer's input is the same in every state, and so goes into the bias."""
         first, *others = network(parameters, "policy")
-        of_states, of_context = first.weight.split([self.obs_dim, self.config.context_dim], 1)
+        of_states, of_context = first.weight.split([self.input_dim, self.config.context_dim], 1)
         conditioned = Layer(of_states, first.bias + of_context @ self.context(parameters, support))
         return NetworkPolicy((conditioned, *others), self.normalise)

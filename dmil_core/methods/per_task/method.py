@@ -6,7 +6,6 @@ import numpy as np
 import torch
 
 from dmil_core.demonstrations import Demonstration
-from dmil_core.losses import Steps
 from dmil_core.methods.base import FineTuning, Method
 from dmil_core.methods.behaviour_cloning.policy import NetworkPolicy, fine_tuned, initial_network
 from dmil_core.methods.per_task.config import PerTaskConfig
@@ -20,11 +19,11 @@ class PerTask(Method[PerTaskConfig]):
 
     def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the network."""
-        return initial_network(self.config, self.obs_dim, self.action_dim, rng)
+        return initial_network(self.config, self.input_dim, self.action_dim, rng)
 
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> NetworkPolicy:
         """Take steps of Adam on the support set."""
-        steps = Steps.of(support, self.normalise)
+        steps = self.practice(support, fine_tuning)
         return NetworkPolicy(
             fine_tuned(network(parameters, "policy"), steps, torch.optim.Adam, fine_tuning), self.normalise
         )

@@ -57,7 +57,7 @@ class Reptile(MetaLearner[ReptileConfig, Batch]):
     def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the network."""
         units = self.config.hidden_units
-        return initialise("policy", [self.obs_dim, units, units, self.action_dim], rng, output_scale=0.1)
+        return initialise("policy", [self.input_dim, units, units, self.action_dim], rng, output_scale=0.1)
 
     def sample(self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator) -> Batch:
         """Draw some demonstrations of the task: all that is random in an iteration is drawn here."""

@@ -32,6 +32,7 @@ from services.distributed.ray_runner import open_runner
 from services.distributed.simulation_worker import SimulationWorker
 from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoints
+from services.suites.metaworld import MetaWorldSuite
 from tests.services.conftest import QUICK_EVALUATION
 from tests.services.distributed.courses import alone, assert_same_bits, follow, pid_of, plan_of
 
@@ -115,8 +116,8 @@ def test_constants_and_a_single_step_are_enough_to_act(experiment: Experiment, d
     kind = method_type(method)
     settings, suite = preset_of("ml10", "smoke", method).method, experiment.suite
     sets = experiment.training_sets(data)
-    made = kind.prepared(settings, suite.action_dim, sets["push"])
-    again = kind.restored(settings, suite.action_dim, made.constants())
+    made = kind.prepared(settings, suite.action_dim, sets["push"], MetaWorldSuite.points)
+    again = kind.restored(settings, suite.action_dim, made.constants(), MetaWorldSuite.points)
     parameters = made.initial_parameters(named_rng(0, "initial"))
     step = sets["push"][0].window(0, 1)
     tuning = tuning_of(method)

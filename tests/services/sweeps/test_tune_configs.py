@@ -34,9 +34,10 @@ ROWS = {
         "behaviour cloning",
         "per task",
         "nearest neighbour",
+        "tracking",
     ],
 }
-FLAT = {"MIL", "PEMIRL", "behaviour cloning", "per task", "nearest neighbour"}
+FLAT = {"MIL", "PEMIRL", "behaviour cloning", "per task", "nearest neighbour", "tracking"}
 """Rows of methods without sub-skills."""
 
 

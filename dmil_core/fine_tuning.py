@@ -1,0 +1,60 @@
+"""Fine-tuning by Adam on batches of states, its rate falling along a cosine: many steps on many displaced copies."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple, TypeAlias
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from dmil_core.losses import Steps, squared_errors
+from dmil_core.networks import Layer, Network, descend
+
+BATCH = 128
+"""States in a step."""
+LAST = 0.01
+"""The last step's rate, as a part of the first one's."""
+Optimiser: TypeAlias = Literal["sgd", "adam"]
+
+
+class FineTuning(NamedTuple):
+    """Gradient steps of adaptation at test; a method without any ignores it."""
+
+    steps: int
+    learning_rate: float
+    optimiser: Optimiser = "sgd"
+    """sgd: plain steps on the whole support set, as in the inner loop; adam: `on_batches`."""
+    displaced: int = 0
+    """Displaced copies of the support set, see `dmil_core.paths.with_copies`."""
+
+
+def on_batches(networks: Sequence[Network], loss: Callable[[Steps], Tensor], steps: Steps, tuning: FineTuning) -> None:
+    """Take `tuning.steps` steps of Adam down a loss of batches of states, changing the networks' leaves in place.
+
+    The states are drawn alike each time, so the same support set gives the same networks.
+    """
+    adam = torch.optim.Adam([tensor for network in networks for layer in network for tensor in layer])
+    generator = torch.Generator().manual_seed(0)
+    for step in range(tuning.steps):
+        along = 0.5 * (1 + math.cos(math.pi * step / tuning.steps))
+        adam.param_groups[0]["lr"] = tuning.learning_rate * (LAST + (1 - LAST) * along)
+        drawn: Int[Tensor, " batch"] = torch.randint(len(steps.states), (BATCH,), generator=generator)
+        descend(adam, loss(Steps(steps.states[drawn], steps.actions[drawn], torch.ones(BATCH, dtype=torch.int64))))
+
+
+def free(network: Network) -> Network:
+    """Return a copy of a network whose tensors ask for gradients."""
+    return tuple(Layer(*(tensor.detach().clone().requires_grad_() for tensor in layer)) for layer in network)
+
+
+def fixed(network: Network) -> Network:
+    """Return a network without graph; no copy."""
+    return tuple(Layer(*(tensor.detach() for tensor in layer)) for layer in network)
+
+
+def mean_error(
+    predictions: Float[Tensor, "steps action_dim"], actions: Float[Tensor, "steps action_dim"]
+) -> Float[Tensor, ""]:
+    """Return ‖π(s) − a‖², averaged over the steps."""
+    return squared_errors(predictions, actions).mean()

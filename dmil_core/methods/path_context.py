@@ -1,0 +1,282 @@
+"""The demonstration before a network's eyes: where the demonstrated hand goes next, from the nearest support state.
+
+For each support demonstration and each observation: the support state that is nearest in differences of positions; the
+demonstrated path of the hand from there, `HORIZONS` steps ahead, in the frame of the hand itself, of the object and of
+the goal, minus where the hand is; the demonstrated actions there; how far the match is; and what of the state itself is
+the same in every place: gripper, heights, last moves. One network turns each demonstration's row into an action and a
+weight, and the weights' softmax combines the actions. It learns across tasks, from some demonstrations of a task to
+others, and adapts by seeing other demonstrations, not by gradients: a form of in-context imitation (DARP, ICLR 2026).
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int
+from torch import Tensor
+
+from dmil_core.demonstrations import Demonstration, Normalisation, PathBatch, TaskBatch
+from dmil_core.errors import UserError
+from dmil_core.loss_gradients import LossGradient, loss_gradient
+from dmil_core.losses import differentiated, squared_errors
+from dmil_core.methods.base import Method, TaskGradient
+from dmil_core.networks import Network, Parameters, initialise, mlp, network, unflatten, without_graph
+from dmil_core.points import Points, moved, position, present
+from dmil_core.settings import ContextConfig
+
+HORIZONS = (0, 1, 3, 6, 10, 16)
+"""Steps ahead on the demonstrated path."""
+SHOTS = (1, 3)
+"""Demonstrations that are seen in meta-training, drawn anew each time."""
+QUERIES, QUERY_STATES = 3, 64
+"""Other demonstrations of a task that are imitated in one slot, and states of them in all."""
+DOUBT, JITTER = 0.3, 2
+"""In half of the rows of meta-training the match is made unsure by Gumbel noise of this scale, in half it is off by up
+to so many steps: at test, matches are never as good."""
+
+
+def _scaled(difference: np.ndarray, reach: float) -> list[np.ndarray]:
+    return [difference / (10 * reach), np.tanh(difference / (2 * reach))]
+
+
+@dataclass(frozen=True)
+class PathView:
+    """What is seen of a state beside the demonstrations' paths, and by what states are compared."""
+
+    points: Points
+    normalise: Normalisation
+    """Compares states where no object is declared."""
+
+    def match(self, observations: Float32[np.ndarray, "steps obs_dim"]) -> Float32[np.ndarray, "steps compared"]:
+        """Return numbers whose squared distance says how alike states are."""
+        points = self.points
+        if points.object is None:
+            return self.normalise(observations)
+        hand, object_, goal, second = (
+            position(observations, axes, points)
+            for axes in (points.hand, points.object, points.goal, points.second_object)
+        )
+        goal_there, second_there = (present(observations, axes, points) for axes in (points.goal, points.second_object))
+        away = np.concatenate(
+            [object_ - hand, (goal - hand) * goal_there, (goal - object_) * goal_there, (second - hand) * second_there],
+            axis=1,
+        )
+        gripper = () if points.gripper is None else (points.gripper,)
+        return np.concatenate(
+            [
+                *_scaled(away, points.reach),
+                hand[:, -1:] / (10 * points.reach),
+                2 * observations[:, list(gripper)] - 1,
+                10 * moved(observations, gripper, points),
+                np.clip(moved(observations, points.hand, points) / (2 * points.reach), -1, 1),
+                np.clip(moved(observations, points.object, points) / points.reach, -1, 1),
+            ],
+            axis=1,
+            dtype=np.float32,
+        )
+
+    def anywhere(self, observations: Float32[np.ndarray, "steps obs_dim"]) -> Float32[np.ndarray, "steps _"]:
+        """Return what of a state does not say where it is: gripper, heights and last moves."""
+        points = self.points
+        if points.object is None:
+            return np.zeros((len(observations), 0), np.float32)
+        gripper = () if points.gripper is None else (points.gripper,)
+        heights = [position(observations, axes, points)[:, -1:] for axes in (points.hand, points.object, points.goal)]
+        return np.concatenate(
+            [
+                2 * observations[:, list(gripper)] - 1,
+                10 * moved(observations, gripper, points),
+                np.concatenate(heights, 1) / (10 * points.reach),
+                np.clip(moved(observations, points.hand, points) / points.reach, -3, 3),
+                np.clip(moved(observations, points.object, points) / points.reach, -3, 3),
+            ],
+            axis=1,
+            dtype=np.float32,
+        )
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A demonstration as it is looked at, step by step."""
+
+    compared: Float32[np.ndarray, "steps compared"]
+    anywhere: Float32[np.ndarray, "steps _"]
+    frames: Sequence[tuple[Float32[np.ndarray, "steps axes"], tuple[int, ...] | None]]
+    """Places of the frames' origins, and where those are in an observation; None for a frame that stays. That of the
+    hand shows what the demonstrated one does next."""
+    ahead: Float32[np.ndarray, "steps horizons axes"]
+    """The hand's places from each step on."""
+    actions: Float32[np.ndarray, "steps action_dim"]
+    others: Float32[np.ndarray, "steps _"]
+    """At the same horizons, the numbers of the actions that do not move the hand."""
+
+
+@dataclass(frozen=True)
+class PathContext:
+    """Demonstrations before a network's eyes."""
+
+    view: PathView
+    seen: tuple[_Seen, ...]
+
+    @classmethod
+    def of(cls, demonstrations: Sequence[Demonstration], view: PathView) -> "PathContext":
+        """Look at some demonstrations of one task."""
+        points = view.points
+        axes = (points.hand, points.object, points.goal) if points.object is not None else (points.hand, None)
+
+        def look(one: Demonstration) -> _Seen:
+            steps = np.arange(len(one))
+            later = np.minimum(steps[:, None] + HORIZONS, len(one) - 1)
+            hand = position(one.observations, points.hand, points)
+            return _Seen(
+                view.match(one.observations),
+                view.anywhere(one.observations),
+                [(position(one.observations, of, points), of) for of in axes],
+                hand[later],
+                one.actions,
+                one.actions[later, len(points.hand) :].reshape(len(one), -1),
+            )
+
+        return cls(view, tuple(map(look, demonstrations)))
+
+    def rows(
+        self, observations: Float32[np.ndarray, "steps obs_dim"], rng: np.random.Generator | None = None
+    ) -> Float[Tensor, "rows features"]:
+        """Return what is seen at each observation of each demonstration, the demonstrations of a step side by side.
+
+        Args:
+            observations: what is acted on.
+            rng: makes the matches worse, as in meta-training; without it they are the nearest.
+        """
+        compared, anywhere = self.view.match(observations), self.view.anywhere(observations)
+        rows = [self._row(observations, compared, anywhere, seen, rng) for seen in self.seen]
+        return torch.from_numpy(np.stack(rows, 1).reshape(len(observations) * len(rows), -1))
+
+    def _row(
+        self,
+        observations: np.ndarray,
+        compared: np.ndarray,
+        anywhere: np.ndarray,
+        seen: _Seen,
+        rng: np.random.Generator | None,
+    ) -> Float32[np.ndarray, "steps features"]:
+        points = self.view.points
+        far = np.square(compared[:, None] - seen.compared).sum(-1)
+        if rng is not None and rng.random() < 0.5:
+            far = far + DOUBT * rng.gumbel(size=far.shape)
+        nearest = far.argmin(1)
+        if rng is not None and rng.random() < 0.5:
+            nearest = np.clip(nearest + rng.integers(-JITTER, JITTER + 1, len(nearest)), 0, len(seen.actions) - 1)
+        hand = position(observations, points.hand, points)
+        parts = []
+        for places, axes in seen.frames:
+            shift = position(observations, axes, points) - places[nearest]
+            error = seen.ahead[nearest] + shift[:, None] - hand[:, None]
+            parts += [part.reshape(len(observations), -1) for part in _scaled(error, points.reach)]
+        parts += [seen.actions[nearest], seen.others[nearest]]
+        parts += [np.abs(seen.compared[nearest] - compared).mean(1, keepdims=True)]
+        parts += [anywhere, anywhere - seen.anywhere[nearest]]
+        return np.concatenate(parts, 1, dtype=np.float32)
+
+
+def combined(outputs: Float[Tensor, "rows outputs"], demonstrations: int) -> Float[Tensor, "steps action_dim"]:
+    """Return the action at each step: the demonstrations' own, weighted by the softmax of their last output."""
+    of_each = outputs.unflatten(0, (-1, demonstrations))
+    return (of_each[..., :-1] * of_each[..., -1:].softmax(1)).sum(1)
+
+
+def sample_path_batch(demonstrations: Sequence[Demonstration], rng: np.random.Generator) -> PathBatch:
+    """Draw one or three demonstrations of a task to see, and others to imitate; a set never sees itself."""
+    order, shots = rng.permutation(len(demonstrations)), int(rng.choice(SHOTS))
+    shots = min(shots, max(1, len(order) - 1))
+    drawn = [demonstrations[index] for index in order]
+    return PathBatch(tuple(drawn[:shots]), tuple(drawn[shots : shots + QUERIES] or drawn), int(rng.integers(2**31)))
+
+
+def path_gradient(network: Network, batch: PathBatch, view: PathView) -> LossGradient:
+    """Return the squared error of what the network does at states of the batch's queries, and its gradient."""
+    rng = np.random.default_rng(batch.seed)
+    observations = np.concatenate([one.observations for one in batch.query])
+    chosen: Int[np.ndarray, " states"] = rng.integers(0, len(observations), QUERY_STATES)
+    actions = torch.from_numpy(np.concatenate([one.actions for one in batch.query])[chosen])
+    context = PathContext.of(batch.context, view)
+
+    def loss(outputs: Tensor) -> Tensor:
+        return squared_errors(combined(outputs, len(batch.context)), actions).mean()
+
+    return loss_gradient(
+        network, context.rows(observations[chosen], rng), lambda outputs: differentiated(loss, outputs)
+    )
+
+
+@dataclass(frozen=True)
+class PathGuide:
+    """What a policy does with a path network: its action is part of the policy's."""
+
+    network: Network
+    context: PathContext
+    share: float
+
+    def blend(
+        self, actions: Float[Tensor, "episodes action_dim"], observations: Float32[np.ndarray, "episodes obs_dim"]
+    ) -> Float[Tensor, "episodes action_dim"]:
+        """Return the weighted mean of a policy's own actions and the path network's, both clipped to [-1, 1]."""
+        outputs = mlp(self.network, self.context.rows(observations))
+        guided = combined(outputs, len(self.context.seen)).clamp(-1, 1)
+        return (1 - self.share) * actions.clamp(-1, 1) + self.share * guided
+
+
+def view_of(method: Method[Any]) -> PathView | None:
+    """Return what a method's path network sees, if it has one.
+
+    Raises:
+        UserError: if it has one, and no points are declared.
+    """
+    if not isinstance(method.config, ContextConfig) or method.config.context == "none":
+        return None
+    if method.points is None:
+        raise UserError("method.context: got path for a suite without points; wanted suite.points, at least hand")
+    return PathView(method.points, method.normalise)
+
+
+def initial_path_network(method: Method[Any], rng: np.random.Generator) -> Parameters:
+    """Draw the parameters ``path.*``, if a method has a path network."""
+    if (view := view_of(method)) is None:
+        return {}
+    size, config = view.points.size, method.config
+    blank = Demonstration("", "", np.zeros((1, size), np.float32), np.zeros((1, method.action_dim), np.float32))
+    seen = PathContext.of([blank], view).rows(blank.observations).shape[1]
+    return initialise("path", [seen, *config.hidden, method.action_dim + 1], rng, output_scale=config.output_scale)
+
+
+def with_path(
+    method: Method[Any], batch: TaskBatch, demonstrations: Sequence[Demonstration], rng: np.random.Generator
+) -> TaskBatch:
+    """Return the batch with what a path network learns from, if a method has one."""
+    if view_of(method) is None:
+        return batch
+    return dataclasses.replace(batch, path=sample_path_batch(demonstrations, rng))
+
+
+def with_path_gradient(
+    method: Method[Any], result: TaskGradient, parameters: Parameters, batch: TaskBatch
+) -> TaskGradient:
+    """Return the gradient with that of the path network, whose part is zero so far, if a method has one."""
+    if (view := view_of(method)) is None:
+        return result
+    assert batch.path is not None
+    of_path = path_gradient(network(parameters, "path"), batch.path, view)
+    views = unflatten(result.gradient, {name: tensor.shape for name, tensor in parameters.items()})
+    of_path.add_to(network(views, "path"))
+    return result._replace(metrics={**result.metrics, "path_loss": of_path.loss.value.item()})
+
+
+def guide_of(method: Method[Any], parameters: Parameters, support: Sequence[Demonstration]) -> PathGuide | None:
+    """Return the path network before a support set, if a method has one."""
+    if (view := view_of(method)) is None:
+        return None
+    layers = network(without_graph(parameters), "path")
+    return PathGuide(layers, PathContext.of(support, view), method.config.context_share)
