@@ -1,5 +1,6 @@
 """Settings of an experiment: frozen, checked, and each with the place in the paper that it comes from."""
 
+import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -9,7 +10,7 @@ from dmil_core.fine_tuning import FineTuning, Optimiser
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.registry import config_type
 from dmil_core.points import Points
-from dmil_core.settings import Count, MethodConfig, NotNegative, Positive, Seed, Settings, Size
+from dmil_core.settings import ContextConfig, Count, MethodConfig, NotNegative, Positive, Seed, Settings, Size
 
 SuiteName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]*$")]
 DEFAULT_METHOD = "dmil"
@@ -217,6 +218,22 @@ SMOKE_TASKS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 """A few meta-training and meta-testing tasks of each suite, for the preset smoke."""
 
 
+WITH_POINTS = re.compile(r"ml(10|10-reference|45|1-.*)|push-around-wall", re.IGNORECASE)
+"""Suites whose points are declared, object and goal among them."""
+WITH_POINTS_QUICK: dict[str, dict[str, Any]] = {
+    "demonstrations": {"held_out": 30},
+    "evaluation": {"support_draws": 10},
+    "method": {"features": "relative"},
+}
+"""What the preset quick has besides for these: which support sets are drawn matters more than most settings."""
+CONTEXT_QUICK: dict[str, dict[str, Any]] = {
+    "training": {"iterations": 2500, "schedule": "cosine"},
+    "evaluation": {"optimiser": "adam", "learning_rate": 1e-3, "fine_tuning_steps": 200, "displaced": 40},
+    "method": {"context": "path"},
+}
+"""And what it has besides for them and for methods with a path network."""
+
+
 def preset_of(suite: str, preset: str, method: str = DEFAULT_METHOD) -> ExperimentConfig:
     """Return the settings of a preset for a suite and a method.
 
@@ -233,8 +250,11 @@ def preset_of(suite: str, preset: str, method: str = DEFAULT_METHOD) -> Experime
             changes["method"]["sub_skills"] = 4  # Table 5's middle column
         if preset == "quick":
             changes["demonstrations"] = {"per_task": 50, "held_out": 12}  # a demonstration takes 1 s
+    seeing: list[dict[str, dict[str, Any]]] = []
+    if preset == "quick" and WITH_POINTS.fullmatch(suite):
+        seeing = [WITH_POINTS_QUICK, *([CONTEXT_QUICK] if issubclass(method_config, ContextConfig) else [])]
     settings = config.model_dump(exclude={"method"}) | {"method": {}}
-    for changed in (method_config.presets.get(preset, {}), changes):
+    for changed in (method_config.presets.get(preset, {}), *seeing, changes):
         settings |= {section: settings[section] | values for section, values in changed.items()}
     return ExperimentConfig.model_validate(settings)
 

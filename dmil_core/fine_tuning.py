@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dmil_core.losses import Steps, squared_errors
-from dmil_core.networks import Layer, Network, descend
+from dmil_core.networks import Adam, Layer, Network, descend
 
 BATCH = 128
 """States in a step."""
@@ -34,11 +34,11 @@ def on_batches(networks: Sequence[Network], loss: Callable[[Steps], Tensor], ste
 
     The states are drawn alike each time, so the same support set gives the same networks.
     """
-    adam = torch.optim.Adam([tensor for network in networks for layer in network for tensor in layer])
+    adam = Adam([tensor for network in networks for layer in network for tensor in layer], tuning.learning_rate)
     generator = torch.Generator().manual_seed(0)
     for step in range(tuning.steps):
         along = 0.5 * (1 + math.cos(math.pi * step / tuning.steps))
-        adam.param_groups[0]["lr"] = tuning.learning_rate * (LAST + (1 - LAST) * along)
+        adam.learning_rate = tuning.learning_rate * (LAST + (1 - LAST) * along)
         drawn: Int[Tensor, " batch"] = torch.randint(len(steps.states), (BATCH,), generator=generator)
         descend(adam, loss(Steps(steps.states[drawn], steps.actions[drawn], torch.ones(BATCH, dtype=torch.int64))))
 

@@ -135,7 +135,7 @@ class Adam:
         self.steps = [torch.tensor(0.0) for _ in self.parameters]
         self.first_moments = [torch.zeros_like(tensor) for tensor in self.parameters]
         self.second_moments = [torch.zeros_like(tensor) for tensor in self.parameters]
-        self._learning_rate, self._weight_decay = learning_rate, weight_decay
+        self.learning_rate, self._weight_decay = learning_rate, weight_decay
 
     def zero_grad(self) -> None:
         """Forget the gradients."""
@@ -150,7 +150,7 @@ class Adam:
         parameters, gradients, first, second, steps = map(list, zip(*tensors, strict=True))
         adam(
             parameters, gradients, first, second, [], steps, fused=True, decoupled_weight_decay=True, amsgrad=False,
-            beta1=0.9, beta2=0.999, lr=self._learning_rate, weight_decay=self._weight_decay, eps=1e-8, maximize=False,
+            beta1=0.9, beta2=0.999, lr=self.learning_rate, weight_decay=self._weight_decay, eps=1e-8, maximize=False,
         )  # fmt: skip
 
 

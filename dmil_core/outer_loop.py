@@ -191,7 +191,7 @@ class OuterStep:
         norm = torch.nn.utils.clip_grad_norm_([self._parameters], limit)
         if norm.isfinite():
             if training.outer_step == "adam":
-                self._adam.param_groups[0]["lr"] = self._learning_rate
+                self._adam.learning_rate = self._learning_rate
                 self._adam.step()
             else:
                 self.parameters.sub_(total, alpha=training.learning_rate)
@@ -201,7 +201,7 @@ class OuterStep:
     @property
     def _learning_rate(self) -> float:
         """Of the next step."""
-        training, done = self._training, int(self._adam.state[self._parameters]["step"])
+        training, done = self._training, int(self._adam.steps[0])
         if training.schedule == "constant":
             return training.learning_rate
         along = 0.5 * (1 + math.cos(math.pi * min(done / training.iterations, 1)))
