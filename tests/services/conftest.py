@@ -53,7 +53,7 @@ def _console() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _unchecked_shapes() -> Iterator[None]:
-    """Whole runs take some times as long where every shape of them is checked, as in the tests of dmil_core."""
+    """Whole runs take twice as long where every shape in them is checked, as the tests of dmil_core do."""
     before = jaxtyping.config.jaxtyping_disable
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
