@@ -14,11 +14,9 @@ from dmil_core.demonstrations import Demonstration, DemonstrationError
 from services.cli.arguments import exit_code, parse
 from services.cli.composition import suite_settings
 from services.cli.progress import Bar, console
-from services.demonstrations.external import FORMS, ExternalEpisode, misfits, read_episodes
+from services.demonstrations.external import FORMS, SUFFIXES, ExternalEpisode, misfits, read_episodes
 from services.suites.base import TaskSuite
 from services.suites.registry import open_suite
-
-SUFFIXES = {".npz": "npz", ".hdf5": "hdf5", ".h5": "hdf5"}
 
 
 @dataclass(frozen=True)

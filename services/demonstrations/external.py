@@ -1,7 +1,7 @@
 """Demonstrations that somebody else has recorded: Minari data sets, D4RL's HDF5 files, npz files (docs/data.md)."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -11,14 +11,19 @@ from minari.storage import get_dataset_path
 from pydantic import BaseModel, Field
 
 from dmil_core.demonstrations import Demonstration, DemonstrationError, digest
+from dmil_core.errors import shorten
 from dmil_core.files import ForeignFileError, inside, named, read_file
 from services.demonstrations.hdf5 import PlainFile, open_plain
+from services.demonstrations.layouts import looks_like, read_lerobot, read_pair, read_robomimic
 from services.demonstrations.npz import read_npz
 from services.demonstrations.store import TaskDemonstrations, data_root
 from services.suites.base import TaskSuite
 
-FORMS = ("minari", "hdf5", "npz")
-"""What data sets may be: an id of Minari's, a file as D4RL has them, a file of arrays."""
+FORMS = ("minari", "hdf5", "npz", "npy", "lerobot")
+"""What data sets may be: an id of Minari's, a file as D4RL or robomimic has them, a file of arrays or a folder of such,
+two files of one array each, the folder of a LeRobot data set."""
+SUFFIXES = {".npz": "npz", ".hdf5": "hdf5", ".h5": "hdf5"}
+"""The form that a file's name stands for."""
 MAX_METADATA = 2**20
 """Bytes of a Minari data set's metadata."""
 VERSION = re.compile(r"-v\d+$")
@@ -50,7 +55,11 @@ def places_of(source: str) -> dict[str, str]:
     Raises:
         DemonstrationError: for another form, or a task named twice.
     """
-    form, _, rest = source.partition(":")
+    form, colon, rest = source.partition(":")
+    if not colon and Path(source).exists():
+        form = SUFFIXES.get(Path(source).suffix, "npz" if Path(source).is_dir() else "")
+        proposal = f"{form}:{source}" if form else f"a form that is read: it looks like {looks_like(Path(source))}"
+        raise DemonstrationError(f"demonstrations.source: got {source}; wanted {proposal}")
     if form not in FORMS or not all(rest.split(",")):
         raise DemonstrationError(
             f"demonstrations.source: got {source}; wanted expert, or one of {', '.join(FORMS)} and a list: "
@@ -59,7 +68,7 @@ def places_of(source: str) -> dict[str, str]:
     places: dict[str, str] = {}
     for part in rest.split(","):
         task, _, place = part.rpartition("=")
-        task = task or VERSION.sub("", Path(place).name.removesuffix(".npz").removesuffix(".hdf5"))
+        task = task or VERSION.sub("", Path(place.partition("#")[0].partition("+")[0]).stem)
         if task in places:
             raise DemonstrationError(f"demonstrations.source: got the task {task} twice; wanted one data set for each")
         places[task] = f"{form}:{place}"
@@ -70,16 +79,19 @@ def read_episodes(place: str) -> list[ExternalEpisode]:
     """Read the episodes of a data set.
 
     Args:
-        place: ``minari:ID``, ``hdf5:PATH`` or ``npz:PATH``.
+        place: ``minari:ID``, ``hdf5:PATH``, ``npz:PATH``, ``npy:PATH+PATH`` or ``lerobot:FOLDER``. Of an HDF5 file as
+            robomimic has them ``hdf5:PATH#KEY+KEY`` chooses and orders the parts of the observations.
 
     Raises:
         DemonstrationError: names the data set, and what of it cannot be read.
     """
     form, _, path = place.partition(":")
     if form == "npz":
-        return [ExternalEpisode(one.observations, one.actions, None, None) for one in read_npz(Path(path), "recorded")]
+        return [ExternalEpisode(one.observations, one.actions, None, None) for one in _read_npz(Path(path))]
     try:
-        return _read_minari(path) if form == "minari" else _read_hdf5(Path(path))
+        if form in ("npy", "lerobot"):
+            return _plain(read_pair(path) if form == "npy" else read_lerobot(Path(path)))
+        return _read_minari(path) if form == "minari" else _read_hdf5(path)
     except (DemonstrationError, ForeignFileError) as error:
         raise DemonstrationError(f"{place}: {error}") from error
     # What h5py raises of files that are not what they look like.
@@ -164,8 +176,33 @@ def _observations(file: PlainFile, name: str) -> Float32[np.ndarray, "steps obs_
     return observations.reshape(len(observations), -1).astype(np.float32)
 
 
-def _read_hdf5(path: Path) -> list[ExternalEpisode]:
-    with open_plain(*named(path)) as file:
+def _plain(episodes: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[ExternalEpisode]:
+    """Return episodes without rewards."""
+    with np.errstate(over="ignore"):  # what does not fit becomes infinite, and is refused
+        return [
+            ExternalEpisode(observations.astype(np.float32), actions.astype(np.float32), None, None)
+            for observations, actions in episodes
+        ]
+
+
+def _read_npz(path: Path) -> list[Demonstration]:
+    """Read a file, or all files of a folder in the order of their names."""
+    files = sorted(path.glob("*.npz")) if path.is_dir() else [path]
+    if not files:
+        raise DemonstrationError(f"{path}: got no .npz file in it; it looks like {looks_like(path)}")
+    return [demonstration for file in files for demonstration in read_npz(file, "recorded")]
+
+
+def _read_hdf5(place: str) -> list[ExternalEpisode]:
+    path, _, keys = place.partition("#")
+    with open_plain(*named(Path(path))) as file:
+        if file.names("data"):
+            return _plain(read_robomimic(file, keys.split("+") if keys else ()))
+        if not (file.has("observations") and file.has("actions")):
+            raise DemonstrationError(
+                f"got {shorten(file.names())}; wanted observations, actions and terminals as D4RL has them, or "
+                "data/demo_0/obs and data/demo_0/actions as robomimic has them"
+            )
         observations, actions = (file.array(name, axes=2) for name in ("observations", "actions"))
         if len(observations) != len(actions):
             raise DemonstrationError(

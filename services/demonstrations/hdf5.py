@@ -40,6 +40,10 @@ class PlainFile:
         """Return whether there is something under a path of the file."""
         return self._member(name) is not None
 
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of an array; of what is none, no axis."""
+        return getattr(self._member(name), "shape", None) or ()
+
     def array(self, name: str, *, axes: int | None = None) -> np.ndarray:
         """Return an array of numbers.
 

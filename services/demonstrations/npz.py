@@ -1,7 +1,8 @@
 """Demonstrations in npz files: numpy's own form, read without trust in it.
 
 A file holds ``observations`` (steps, dimensions) and ``actions`` (steps, dimensions) of all demonstrations, one after
-the other, and ``episode_lengths`` (demonstrations); it may hold ``tasks``, names of what is done in them.
+the other, and ``episode_lengths`` (demonstrations); it may hold ``tasks``, names of what is done in them. Without
+lengths it is one demonstration, or, with an axis more in front, a stack of demonstrations that are equally long.
 """
 
 import io
@@ -9,6 +10,7 @@ import math
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +19,14 @@ from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.errors import shorten
 from dmil_core.files import named, read_file
 
-FORMS = {"observations": ("f", 2), "actions": ("f", 2), "episode_lengths": ("iu", 1), "tasks": ("U", 1)}
-"""Of each array, the kinds of numbers and the number of axes."""
-OPTIONAL = {"tasks"}
+FORMS = {
+    "observations": ("f", (2, 3)),
+    "actions": ("f", (2, 3)),
+    "episode_lengths": ("iu", (1,)),
+    "tasks": ("U", (1,)),
+}
+"""Of each array, the kinds of numbers and the numbers of axes."""
+OPTIONAL = {"episode_lengths", "tasks"}
 MOST_ARCHIVE = 2**28
 """Bytes of a file."""
 MOST_ARRAYS = 2**29
@@ -29,6 +36,13 @@ MOST_PACKED = 200
 """Bytes of an array for each byte in the file; demonstrations have some 2."""
 MOST_DIRECTORY = 2**12
 """Bytes of an archive's directory; a member takes some 60."""
+
+SYNONYMS = {
+    "observations": ("obs", "observation", "states", "state", "qpos", "s"),
+    "actions": ("acts", "action", "act", "a"),
+    "episode_lengths": ("lengths", "episode_length", "traj_lengths"),
+}
+"""Other names of arrays."""
 
 END = b"PK\x05\x06"
 """Begins the 22 bytes that end an archive without a comment."""
@@ -52,20 +66,20 @@ def read_npz(path: Path, task: str, obs_dim: int | None = None) -> list[Demonstr
     """
     try:
         arrays = _read_arrays(read_file(*named(path), MOST_ARCHIVE))
-        observations, actions, lengths = (arrays[name] for name in ("observations", "actions", "episode_lengths"))
-        _check_lengths(lengths, len(observations), len(actions))
-        if obs_dim is not None and not 0 < obs_dim <= observations.shape[1]:
-            raise DemonstrationError(
-                f"observations: got {observations.shape[1]} columns; wanted the first {obs_dim} of them"
-            )
-        ends = np.cumsum(lengths.astype(np.int64)).tolist()
+        episodes = episodes_in(arrays["observations"], arrays["actions"], arrays.get("episode_lengths"))
+        columns = episodes[0][0].shape[1]
+        if obs_dim is not None and not 0 < obs_dim <= columns:
+            raise DemonstrationError(f"observations: got {columns} columns; wanted the first {obs_dim} of them")
         with np.errstate(over="ignore"):  # what does not fit becomes infinite, and is refused
-            observations = np.ascontiguousarray(observations[:, :obs_dim], np.float32)
-            actions = np.ascontiguousarray(actions, np.float32)
-        return [
-            Demonstration(f"{index:03d}", task, observations[start:end], actions[start:end])
-            for index, (start, end) in enumerate(zip([0, *ends[:-1]], ends, strict=True))
-        ]
+            return [
+                Demonstration(
+                    f"{index:03d}",
+                    task,
+                    np.ascontiguousarray(observations[:, :obs_dim], np.float32),
+                    np.ascontiguousarray(actions, np.float32),
+                )
+                for index, (observations, actions) in enumerate(episodes)
+            ]
     # What zipfile and numpy raise of damaged files; NotImplementedError and RuntimeError for what they do not read.
     except (
         OSError, ValueError, TypeError, EOFError, SyntaxError, MemoryError, RuntimeError,
@@ -74,6 +88,52 @@ def read_npz(path: Path, task: str, obs_dim: int | None = None) -> list[Demonstr
         known = isinstance(error, DemonstrationError)
         got = str(error) if known else f"got {type(error).__name__}, {error}; wanted an npz file as numpy writes it"
         raise DemonstrationError(f"{path}: {got}") from error
+
+
+def episodes_in(
+    observations: np.ndarray, actions: np.ndarray, lengths: np.ndarray | None
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the observations and actions of each episode.
+
+    Args:
+        observations: (steps, numbers) of all episodes, or stacked, (episodes, steps, numbers).
+        actions: likewise.
+        lengths: of the episodes, where they lie one after the other; none if it is one, or they are stacked.
+
+    Raises:
+        DemonstrationError: if they do not belong together.
+    """
+    if observations.ndim != actions.ndim:
+        raise DemonstrationError(
+            f"got observations of the shape {observations.shape} and actions of {actions.shape}; wanted as many axes"
+        )
+    if observations.ndim == 3:
+        if lengths is not None or not 0 < len(observations) == len(actions) <= MOST_DEMONSTRATIONS:
+            raise DemonstrationError(
+                f"got {len(observations)} stacked episodes of observations and {len(actions)} of actions"
+                f"{', and episode_lengths' * (lengths is not None)}; wanted as many of both and no lengths: lay "
+                "episodes that are not equally long one after the other"
+            )
+        return [_paired(*both) for both in zip(observations, actions, strict=True)]
+    if lengths is None:
+        return [_paired(observations, actions)]
+    _check_lengths(lengths, len(observations), len(actions))
+    cuts = np.cumsum(lengths.astype(np.int64))[:-1].tolist()
+    return list(zip(np.split(observations, cuts), np.split(actions, cuts), strict=True))
+
+
+def _paired(observations: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Leave out an observation after the last action.
+
+    Raises:
+        DemonstrationError: if there are not as many of both then.
+    """
+    if len(observations) not in (len(actions), len(actions) + 1):
+        raise DemonstrationError(
+            f"got {len(observations)} observations for {len(actions)} actions; wanted as many of both, or, of several "
+            "episodes one after the other, episode_lengths too"
+        )
+    return observations[: len(actions)], actions
 
 
 def _check_lengths(lengths: np.ndarray, observations: int, actions: int) -> None:
@@ -108,7 +168,10 @@ def _check_members(members: list[zipfile.ZipInfo]) -> None:
     names = [member.filename for member in members]
     wanted = {f"{name}.npy" for name in FORMS}
     if len(set(names)) != len(names) or not {f"{name}.npy" for name in FORMS.keys() - OPTIONAL} <= set(names) <= wanted:
-        raise DemonstrationError(f"got the members {shorten(names)}; wanted {', '.join(sorted(wanted))}, each once")
+        raise DemonstrationError(
+            f"got the members {shorten(names)}; wanted {', '.join(sorted(wanted))}, each once"
+            f"{renaming([name.removesuffix('.npy') for name in names])}"
+        )
     for member in members:
         if member.flag_bits & 1 or member.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
             raise DemonstrationError(
@@ -135,19 +198,46 @@ def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str) ->
     """
     with archive.open(member) as file:
         content = file.read(member.file_size)  # without a number it would unpack more, and only then cut off
+    return array_in(content, name, *FORMS[name])
+
+
+def array_in(content: bytes, name: str, kinds: str, axes: tuple[int, ...]) -> np.ndarray:
+    """Return the array of a .npy file, whose header is checked before memory is taken for it.
+
+    Args:
+        content: of the file.
+        name: of the array in messages.
+        kinds: of numbers that it may have, as `numpy.dtype.kind` names them.
+        axes: how many it may have.
+
+    Raises:
+        ValueError: if the header is not one of numpy's, or the array would have another size than there is.
+    """
     stream = io.BytesIO(content)
     if (version := np.lib.format.read_magic(stream)) != (1, 0):
         raise DemonstrationError(f"{name}: got numpy's format {version}; wanted numbers or text in its format 1.0")
     shape, _, dtype = np.lib.format.read_array_header_1_0(stream, max_header_size=MOST_HEADER)
-    kinds, axes = FORMS[name]
     if not dtype.isnative:
         raise DemonstrationError(f"{name}: got the byte order of {dtype.str}; wanted this machine's")
-    if dtype.kind not in kinds or len(shape) != axes:
+    if dtype.kind not in kinds or len(shape) not in axes:
         raise DemonstrationError(
-            f"{name}: got {dtype} of the shape {shape}; wanted {axes} axes and a type of the kind {' or '.join(kinds)}"
+            f"{name}: got {dtype} of the shape {shape}; wanted {' or '.join(map(str, axes))} axes and a type of the "
+            f"kind {' or '.join(kinds)}"
         )
     wanted = math.prod(shape) * dtype.itemsize
     if (there := len(content) - stream.tell()) != wanted or min(shape) < 0:
         raise DemonstrationError(f"{name}: got {there} bytes for {dtype} of the shape {shape}; wanted {wanted}")
     stream.seek(0)
     return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+def renaming(names: Sequence[str]) -> str:
+    """Return the line that renames arrays to what is wanted, as far as their names can be guessed; else nothing."""
+    found = {
+        wanted: next((name for name in names if name.lower() in (wanted, *others)), None)
+        for wanted, others in SYNONYMS.items()
+    }
+    if found["observations"] is None or found["actions"] is None:
+        return ""
+    arrays = ", ".join(f'{wanted}=a["{name}"]' for wanted, name in found.items() if name is not None)
+    return f'; a = numpy.load("PATH"); numpy.savez("NEW.npz", {arrays})'

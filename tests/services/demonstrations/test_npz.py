@@ -82,7 +82,10 @@ MISTAKES: dict[str, tuple[Callable[[Arrays], object], str]] = {
     "infinite action": (with_value("actions", -np.inf), "demonstration 001 of kettle: actions at step 0"),
     "beyond float32": (changed("observations", np.full((9, 6), 1e300)), "observations at step 0 is not finite"),
     "one axis": (changed("actions", np.zeros(9)), "actions: got float64 of the shape (9,)"),
-    "three axes": (changed("observations", np.zeros((9, 2, 3))), "observations: got float64 of the shape (9, 2, 3)"),
+    "three axes": (
+        changed("observations", np.zeros((9, 2, 3))),
+        "got observations of the shape (9, 2, 3) and actions of",
+    ),
     "integers": (changed("actions", np.zeros((9, 2), int)), "actions: got int64"),
     "big-endian": (changed("actions", np.zeros((9, 2), ">f4")), "actions: got the byte order of >f4"),
     "complex": (changed("actions", np.zeros((9, 2), complex)), "actions: got complex128"),
