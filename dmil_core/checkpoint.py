@@ -55,7 +55,7 @@ ADDED = {
     "suite": {"points"},
     "method": {"features", "absolute_position", "context", "context_share"},
     "training": {"schedule"},
-    "evaluation": {"optimiser", "displaced"},
+    "evaluation": {"optimiser", "displaced", "controls"},
 }
 """Settings that version 0.1 did not have: where they have their defaults, a digest is as it was without them."""
 

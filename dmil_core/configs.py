@@ -108,6 +108,9 @@ class TrainingConfig(Settings):
     """Newest checkpoints that are kept, besides the best one."""
 
 
+Control = Literal["no-adaptation", "other-support", "shuffled-actions", "nearest-neighbour", "tracking"]
+
+
 class EvaluationConfig(Settings):
     """Few-shot adaptation and its test episodes."""
 
@@ -127,6 +130,10 @@ class EvaluationConfig(Settings):
     displaced: Annotated[int, Field(ge=0, le=10_000)] = 0
     """Copies of the support set with object and goal displaced, to fine-tune on besides; only where a suite declares
     points."""
+    controls: tuple[Control, ...] = ()
+    """What to lay beside the run on meta-testing tasks, with the same support sets and episodes: no-adaptation (no
+    fine-tuning), other-support (another task's demonstrations), shuffled-actions, and nearest-neighbour and tracking,
+    which learn nothing."""
     every: Count | None = None
     """Iterations between evaluations, a multiple of checkpoint_every; none evaluates at the end alone."""
 
@@ -222,7 +229,7 @@ WITH_POINTS = re.compile(r"ml(10|10-reference|45|1-.*)|push-around-wall", re.IGN
 """Suites whose points are declared, object and goal among them."""
 WITH_POINTS_QUICK: dict[str, dict[str, Any]] = {
     "demonstrations": {"held_out": 30},
-    "evaluation": {"support_draws": 10},
+    "evaluation": {"support_draws": 10, "controls": ("no-adaptation", "nearest-neighbour", "tracking")},
     "method": {"features": "relative"},
 }
 """What the preset quick has besides for these: which support sets are drawn matters more than most settings."""

@@ -96,6 +96,31 @@ def stratified_bootstrap(
     return Mean(float(outcomes.mean()), float(low), float(high), outcomes.size)
 
 
+def nested_bootstrap(
+    outcomes: Sequence[Sequence[Sequence[float]]], draw: np.random.Generator, confidence: float = 0.95
+) -> Mean:
+    """Return the mean outcome with the percentile interval that resamples tasks, their support sets, their episodes.
+
+    Args:
+        outcomes: of each episode, by task and support set; differences of paired episodes are outcomes too.
+        draw: the rng of the resampling.
+        confidence: of the interval.
+    """
+    means = []
+    for _ in range(BOOTSTRAP_DRAWS):
+        of_tasks = []
+        for task in draw.integers(len(outcomes), size=len(outcomes)):
+            sets = outcomes[task]
+            drawn = [np.array(sets[number]) for number in draw.integers(len(sets), size=len(sets))]
+            again = [episodes[draw.integers(len(episodes), size=len(episodes))] for episodes in drawn]
+            of_tasks.append(np.concatenate(again).mean())
+        means.append(np.mean(of_tasks))
+    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
+    every = [float(np.mean(np.concatenate([np.array(episodes) for episodes in sets]))) for sets in outcomes]
+    count = sum(len(episodes) for sets in outcomes for episodes in sets)
+    return Mean(float(np.mean(every)), float(low), float(high), count)
+
+
 def interquartile_mean(values: Sequence[float]) -> float:
     """Return the mean of the middle half of `values` (Agarwal et al., NeurIPS 2021: of all runs on all tasks)."""
     cut = len(values) // 4

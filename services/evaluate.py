@@ -77,10 +77,11 @@ def _carry_out(args: Arguments, checkpoint: Checkpoint, experiment: Experiment) 
         data = experiment.collect(runner)
         clock.lap("collect")
         evaluation = experiment.evaluate(runner, data, checkpoint, args.output, args.tasks)
+        controls = experiment.evaluate_controls(runner, data, evaluation, args.output, args.tasks)
         if promotion is not None:
             promotion.evaluate_champion(runner, data)
         clock.lap("evaluate")
-    summary = summarise(evaluation, seconds=clock.seconds, folder=args.output)
+    summary = summarise(evaluation, seconds=clock.seconds, folder=args.output, controls=controls)
     write_report(summary, args.output)
     show(summary)
     if promotion is not None:

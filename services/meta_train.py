@@ -122,8 +122,11 @@ def _carry_out(args: Arguments, folder: Path, experiment: Experiment) -> None:
             )
             clock.lap("train")
             evaluation = experiment.evaluate(runner, data, trained, folder)
+            controls = experiment.evaluate_controls(runner, data, evaluation, folder)
             clock.lap("evaluate")
-        summary = summarise(evaluation, seconds=clock.seconds, folder=folder, mlflow_run_id=tracker.run_id)
+        summary = summarise(
+            evaluation, seconds=clock.seconds, folder=folder, mlflow_run_id=tracker.run_id, controls=controls
+        )
         write_report(summary, folder)
         from services.reporting.run_report import write_run_page  # takes seconds to import: not for --help
 

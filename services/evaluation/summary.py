@@ -15,6 +15,7 @@ from dmil_core.files import write_file
 from dmil_core.settings import MethodConfig
 from dmil_core.statistics import interval_text, mean_score, share_entropy, success_rate
 from services.cli.escapes import for_markdown
+from services.evaluation.controls import HEAD, ControlRow, said
 from services.evaluation.paper_results import Published, figure_of
 from services.evaluation.results import AdaptationResult, EpisodeResult
 from services.suites.base import Split
@@ -107,6 +108,8 @@ class Summary(BaseModel):
     """Attempts of each task's expert that were no success and so no demonstration."""
     demonstrations: dict[str, int] = {}
     """Of each task, those held out among them; older files have none."""
+    controls: list[ControlRow] = []
+    """Beside the run on meta-testing tasks, where the settings ask for any."""
 
     @property
     def collapsed(self) -> bool:
@@ -194,7 +197,12 @@ def rates(rows: Sequence[SummaryRow], use: Mapping[Split, SubSkillShares]) -> di
 
 
 def summarise(
-    evaluation: Evaluation, *, seconds: dict[str, float], folder: Path, mlflow_run_id: str | None = None
+    evaluation: Evaluation,
+    *,
+    seconds: dict[str, float],
+    folder: Path,
+    mlflow_run_id: str | None = None,
+    controls: Sequence[ControlRow] = (),
 ) -> Summary:
     """Return the summary of an evaluation whose report is to lie in `folder`."""
     config = evaluation.checkpoint.manifest.config
@@ -212,6 +220,7 @@ def summarise(
         mlflow_run_id=mlflow_run_id,
         failed_attempts=evaluation.failed_attempts,
         demonstrations=evaluation.demonstrations,
+        controls=list(controls),
     )
 
 
@@ -227,6 +236,16 @@ def table(summary: Summary) -> Table:
     return view
 
 
+def control_table(summary: Summary) -> Table:
+    """Lay the controls out for the terminal."""
+    view = Table(title="Controls, in the same episodes")
+    for number, column in enumerate(HEAD):
+        view.add_column(column, justify="right" if number else "left")
+    for row in summary.controls:
+        view.add_row(*row.fields)
+    return view
+
+
 def table_markdown(summary: Summary) -> str:
     """Lay the summary out as Markdown, with the success rate, and the score if there is one, of each task below."""
     head, *rows = headline(summary)
@@ -236,6 +255,9 @@ def table_markdown(summary: Summary) -> str:
         head = ["task", *(f"{cell.shots}-shot" for cell in cells)]
         tasks = ([task, *(_of_task(cell, task) for cell in cells)] for task in sorted(cells[0].per_task))
         lines += ["", *markdown_rows(head, tasks)]
+    if summary.controls:
+        rows = (row.fields for row in summary.controls)
+        lines += ["", *markdown_rows(HEAD, rows), "", *(f"{sentence}." for sentence in said(summary.controls))]
     return f"Success rates of {for_markdown(described(summary))}.\n\n" + "\n".join(lines) + "\n"
 
 

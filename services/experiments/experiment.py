@@ -22,7 +22,9 @@ from services.demonstrations.store import DemoStore, TaskDemonstrations
 from services.distributed.failures import keeping_failures
 from services.distributed.runner import Plan, Runner
 from services.distributed.work_items import AdaptationRollouts
+from services.evaluation.controls import ControlRow, control_items, control_rows
 from services.evaluation.evaluator import Evaluations, Evaluator, Tallies, write_evaluation
+from services.evaluation.results import write_rows
 from services.evaluation.summary import Evaluation
 from services.experiments.meta_training import CheckpointWriter, IterationLog, meta_train
 from services.rollouts.adaptations import AdaptationOutcome
@@ -51,6 +53,11 @@ class Experiment:
             raise UserError(f"training.iterations: got {iterations}; wanted 0: {name} has no meta-training")
         self.suite: TaskSuite = open_suite(config.suite)
         self.config = config = with_points(config, self.suite)
+        if "tracking" in config.evaluation.controls and config.suite.points is None:
+            raise UserError(
+                f"evaluation.controls: got tracking for {config.suite.name}, which declares no points; wanted "
+                "suite.points, see docs/your-own-task.md; or leave it out"
+            )
         self.store = store
         self._collection = DemonstrationCollection(config, self.suite, store)
 
@@ -209,6 +216,42 @@ class Experiment:
         evaluation = evaluator.evaluation(checkpoint, [outcomes[index] for index in range(len(evaluator.adaptations))])
         write_evaluation(evaluation, folder)
         return evaluation
+
+    def evaluate_controls(
+        self,
+        runner: Runner,
+        data: Mapping[str, TaskDemonstrations],
+        evaluation: Evaluation,
+        folder: Path,
+        only: Collection[str] | None = None,
+    ) -> list[ControlRow]:
+        """Return what the controls of the settings did beside an evaluation, on its meta-testing tasks.
+
+        Their episodes are written to ``controls/NAME/episodes.jsonl`` in `folder`.
+        """
+        rows: list[ControlRow] = []
+        if not (controls := self.config.evaluation.controls):
+            return rows
+        named = [of for of in self.tasks if of[0] == "meta-testing" and (only is None or of[1] in only)]
+        sets, held_out = self.training_sets(data), self.held_out_sets(data)
+        evaluator = Evaluator(runner, self.config, self.suite, named, data, held_out)
+        items = evaluator.items(evaluation.checkpoint, AdaptationRollouts)
+        total = len(controls) * sum(len(each.episodes) for each in evaluator.adaptations)
+        with (
+            Bar("controls", total, 0, "episodes") as bar,
+            keeping_failures(folder, self.config, lambda: evaluation.checkpoint.path),
+        ):
+            for control in controls:
+                outcomes: dict[int, AdaptationOutcome] = {}
+                of_control = control_items(control, items, self.config, self.suite.action_dim, runner, sets, held_out)
+                for index, outcome in runner.simulate(of_control):
+                    outcomes[index] = outcome
+                    bar.advance(len(evaluator.adaptations[index].episodes))
+                done = [outcomes[index] for index in range(len(items))]
+                episodes = evaluator.evaluation(evaluation.checkpoint, done).episodes
+                write_rows(folder / "controls" / control / "episodes.jsonl", episodes)
+                rows += control_rows(control, episodes, evaluation.episodes)
+        return rows
 
     def evaluator(
         self, runner: Runner, data: Mapping[str, TaskDemonstrations], only: Collection[str] | None = None

@@ -6,7 +6,16 @@ from pathlib import Path
 from dmil_core.checkpoint import Checkpoint
 from dmil_core.files import write_file
 from services.cli.progress import console
-from services.evaluation.summary import AGAINST_COLLAPSE, Summary, rates, table, table_markdown, write_summary
+from services.evaluation.controls import said
+from services.evaluation.summary import (
+    AGAINST_COLLAPSE,
+    Summary,
+    control_table,
+    rates,
+    table,
+    table_markdown,
+    write_summary,
+)
 from services.tracking.tracker import Tracker
 
 REPORT, PAGE = "report", "report.html"
@@ -36,6 +45,10 @@ def publish(tracker: Tracker, summary: Summary, folder: Path) -> None:
 def show(summary: Summary, addresses: Sequence[str] = ()) -> None:
     """Print the table, the use of sub-skills, the seconds, and where everything is, the MLflow run too if given."""
     console.print(table(summary))
+    if summary.controls:
+        console.print(control_table(summary))
+        for sentence in said(summary.controls):
+            console.print(sentence)
     for split, use in summary.sub_skills.items():
         shares = ", ".join(f"{share:.2f}" for share in use.share)
         console.print(

@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
 from dmil_core.statistics import Mean, interval_text, mean_score, success_rate
+from services.evaluation.controls import HEAD, said
 from services.evaluation.results import EpisodeResult
 from services.evaluation.summary import AGAINST_COLLAPSE, described, headline
 from services.experiments.finished_run import FinishedRun
@@ -54,6 +55,10 @@ def table_of_all(finished: FinishedRun) -> list[Part]:
     intervals = "Wilson's; of scores Student's, over episodes" if finished.best_score > 1 else "Wilson's"
     beside = "; the paper's figures stand beside ours" if any(cell.paper for cell in summary.rows) else ""
     parts.append(DataTable("Success rates", head, rows))
+    if summary.controls:
+        rows = [row.fields for row in summary.controls]
+        parts.append(DataTable("Controls, in the same episodes of new tasks", HEAD, rows))
+        parts.append(Prose(" ".join(f"{sentence}." for sentence in said(summary.controls))))
     return [*parts, Prose(f"Shots are demonstrations adapted to. Intervals are {intervals}{beside}.")]
 
 

@@ -84,7 +84,8 @@ class TaskSuite(Protocol):
 def with_points(config: ExperimentConfig, suite: TaskSuite) -> ExperimentConfig:
     """Return the settings with the points that the suite declares, where any are used and none are given."""
     declared: Points | None = getattr(suite, "points", None)
-    used = config.method.uses_points or config.evaluation.displaced
+    evaluation = config.evaluation
+    used = config.method.uses_points or evaluation.displaced or "tracking" in evaluation.controls
     if declared is None or not used or config.suite.points is not None:
         return config
     return config.model_copy(update={"suite": config.suite.model_copy(update={"points": declared})})

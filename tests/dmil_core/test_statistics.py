@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from dmil_core.statistics import (
     interquartile_mean,
+    nested_bootstrap,
     performance_profile,
     profile_band,
     share_entropy,
@@ -128,3 +129,20 @@ def test_a_band_of_one_seed_has_no_width() -> None:
     runs, thresholds = np.array([[0.0, 0.5, 1.0]]), np.array([0.0, 0.5])
     for end in profile_band(runs, thresholds, np.random.default_rng(0)):
         np.testing.assert_allclose(end, performance_profile(runs, thresholds))
+
+
+def test_a_nested_interval_covers_tasks_support_sets_and_episodes() -> None:
+    """Where episodes of a support set are alike and sets differ, more episodes do not narrow it."""
+    rng = np.random.default_rng(0)
+    sets = rng.integers(0, 2, (6, 10))
+    few, many = (
+        nested_bootstrap([[[float(value)] * count for value in task] for task in sets], np.random.default_rng(1))
+        for count in (2, 20)
+    )
+    assert few.mean == many.mean == pytest.approx(sets.mean())
+    assert (few.episodes, many.episodes) == (120, 1200)
+    assert many.high - many.low == pytest.approx(few.high - few.low, abs=0.03)
+    wilson = success_rate([bool(value) for value in np.repeat(sets, 20)])
+    assert many.high - many.low > 2 * (wilson.high - wilson.low)
+    same = nested_bootstrap([[[0.5, 0.5]], [[0.5]]], np.random.default_rng(0))
+    assert same[:3] == (0.5, 0.5, 0.5)

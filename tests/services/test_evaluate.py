@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from services import evaluate
@@ -28,6 +29,27 @@ def test_it_finds_what_the_run_itself_found(programs, trained: Path):
     for key in ("rows", "sub_skills", "checkpoint_digest", "protocol", "seed"):
         assert again[key] == before[key]
     assert Path("again/report/table.md").read_text() == (trained / "report" / "table.md").read_text()
+
+
+@pytest.mark.usefixtures("trained")
+def test_controls_stand_beside_the_run(programs):
+    names = ("no-adaptation", "other-support", "shuffled-actions", "nearest-neighbour", "tracking")
+    flags = ("--evaluation.controls", *names, "--runner", "local", "--output", "again")
+    code, printed = programs("evaluate", "--checkpoint", "runs/run", *flags)
+    assert code == 0, printed
+    run = read_rows(Path("again/episodes.jsonl"), EpisodeResult)
+    summary = json.loads(Path("again/summary.json").read_text())
+    assert [row["control"] for row in summary["controls"]] == list(names)
+    for row in summary["controls"]:
+        rows = read_rows(Path("again/controls", row["control"], "episodes.jsonl"), EpisodeResult)
+        new = [one for one in run if one.split == "meta-testing"]
+        assert [(one.task, one.episode, one.seed) for one in rows] == [(one.task, one.episode, one.seed) for one in new]
+        assert row["episodes"] == len(rows) > 0
+        assert row["success_rate"] == np.mean([one.success for one in rows])
+        assert row["difference"] == pytest.approx(np.mean([one.success for one in new]) - row["success_rate"])
+        assert row["low"] <= row["difference"] <= row["high"]
+    assert "1-shot on new tasks: fine-tuning adds " in printed.replace("\n", " ")
+    assert "the best control, " in Path("again/report/table.md").read_text()
 
 
 @pytest.mark.thorough
