@@ -65,7 +65,7 @@ def test_one_demonstration_is_taken_with_the_runs_own_steps_and_success_is_measu
     assert "warning: unlike meta-training, as ml10 has it (reach, push, drawer-close): observation" in printed
     assert "one demonstration: none can be left out" in printed
     assert re.search(r"success in door-close of ml10-part \(.*\): [01] of 1, [01].00, 95% interval 0\.\d+ to", printed)
-    assert dmil.load_policy("policy").origin.fine_tuning == (0, 1e-9)
+    assert dmil.load_policy("policy").origin.fine_tuning[:2] == (0, 1e-9)
 
 
 def test_a_checkpoint_holds_what_acting_needs(finished: FinishedRun, experiment: Experiment):
@@ -74,8 +74,8 @@ def test_a_checkpoint_holds_what_acting_needs(finished: FinishedRun, experiment:
     assert manifest.observed is not None
     sets = experiment.training_sets(finished.demonstrations)
     seen = np.concatenate([one.observations for task in sets.values() for one in task])
-    np.testing.assert_array_equal(np.float32(manifest.observed.low), seen.min(0))
-    np.testing.assert_array_equal(np.float32(manifest.observed.high), seen.max(0))
+    np.testing.assert_array_equal(np.array(manifest.observed.low, np.float32), seen.min(0))
+    np.testing.assert_array_equal(np.array(manifest.observed.high, np.float32), seen.max(0))
 
 
 @pytest.mark.parametrize(
