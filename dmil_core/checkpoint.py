@@ -53,7 +53,7 @@ FILES = {
 Model = TypeVar("Model", bound=BaseModel)
 ADDED = {
     "suite": {"points"},
-    "method": {"features", "absolute_position", "context", "context_share"},
+    "method": {"features", "absolute_position", "context", "context_share", "balance", "labels_until"},
     "training": {"schedule"},
     "evaluation": {"optimiser", "displaced", "controls"},
 }

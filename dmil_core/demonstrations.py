@@ -100,6 +100,8 @@ class TaskBatch:
     query_low: tuple[Demonstration, ...]
     path: "PathBatch | None" = None
     """What a path network learns from, if there is one."""
+    on_labels: bool = False
+    """Whether DMIL's sub-skills learn on the labels."""
 
     @property
     def sets(self) -> tuple[tuple[Demonstration, ...], ...]:

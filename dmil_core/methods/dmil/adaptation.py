@@ -13,7 +13,7 @@ from dmil_core.fine_tuning import FineTuning, fixed, free, mean_error, on_batche
 from dmil_core.loss_gradients import LossGradient, loss_gradient
 from dmil_core.losses import Steps, bank_errors, behaviour_cloning_loss, squared_errors, sub_skill_labels
 from dmil_core.methods.dmil.config import DmilConfig
-from dmil_core.methods.dmil.losses import Targets, high_level_loss, targets_of
+from dmil_core.methods.dmil.losses import Targets, hard_labels, high_level_loss, targets_of
 from dmil_core.networks import Network, Parameters, bank, mlp, network, own_states, routed, stacked, without_graph
 
 
@@ -83,7 +83,13 @@ def sub_skill_gradients(low: Sequence[Network], steps: Steps, chosen: Int[Tensor
 
 
 def inner_loop(
-    hierarchy: Hierarchy, support_high: Steps, support_low: Steps, config: DmilConfig, *, keep: bool = False
+    hierarchy: Hierarchy,
+    support_high: Steps,
+    support_low: Steps,
+    config: DmilConfig,
+    *,
+    keep: bool = False,
+    on_labels: bool = False,
 ) -> Iterator[InnerStep]:
     """Yield the steps of the dual inner loop, without end (Algorithm 1); `hierarchy` stays unchanged.
 
@@ -95,6 +101,7 @@ def inner_loop(
         config: α, which levels are adapted, and to what; the other level stays as it is.
         keep: leave each step's networks unchanged, for `LossGradient.jacobian_product`; else the next step overwrites
             them.
+        on_labels: each sub-skill learns on the states that the labels give it, not on those of the high level.
     """
     high, low = hierarchy
 
@@ -109,7 +116,8 @@ def inner_loop(
         of_high = high_level_gradient(high, support_high, targets_of(torch.stack(errors), config, inner=True), config)
         if config.adapted != "low":
             high = descend(of_high, hierarchy.high)
-        of_low = sub_skill_gradients(low, support_low, choose(high, support_low.states))
+        own = hard_labels(bank_errors(low, support_low), config) if on_labels else choose(high, support_low.states)
+        of_low = sub_skill_gradients(low, support_low, own)
         if config.adapted != "high":
             low = tuple(descend(of_low[k], hierarchy.low[k]) if k in of_low else low[k] for k in range(len(low)))
         yield InnerStep(of_high, of_low, Hierarchy(high, low))

@@ -1,7 +1,9 @@
 """The settings of Dual Meta Imitation Learning, each with the place in the paper that it comes from."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field
 
 from dmil_core.settings import (
     QUICK_NETWORK,
@@ -38,6 +40,12 @@ class DmilConfig(HierarchicalConfig, NetworkConfig, WindowConfig, ContextConfig)
     continuity: Literal["expected", "reference"] = "expected"
     """Continuity loss: expected is the expected number of switches; reference is the count of equation 15, as in the
     authors' released code, which has no gradient."""
+    balance: Literal["none", "sinkhorn"] = "none"
+    """Labels in meta-training: none gives each state to the sub-skill that fits best (equation 3); sinkhorn also gives
+    each sub-skill about as many of a set's states, so that none is left without any."""
+    labels_until: Annotated[int, Field(ge=0, le=10**9)] = 0
+    """In so many first iterations of meta-training a sub-skill learns where the labels say, not where the high level
+    has chosen it: one that is never chosen learns too."""
     order: Literal["first", "second"] = "second"
     """Order of the meta-gradient: second is exact, first is taken at the adapted parameters."""
 

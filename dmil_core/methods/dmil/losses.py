@@ -29,10 +29,32 @@ def soft_labels(
     return posterior.T if transposed else posterior.reshape(posterior.shape[::-1])
 
 
+SHARPNESS, ROUNDS = 0.05, 20
+"""Entropic regularisation of balanced labels, in units of the mean error, and their rounds of normalisation."""
+
+
+def balanced_labels(errors: Float[Tensor, "sub_skills steps"]) -> Int[Tensor, " steps"]:
+    """Return the sub-skill of each step so that each has about as many: argmax of the Sinkhorn plan (Cuturi 2013).
+
+    The plan gives each step a total weight of one and each sub-skill an equal part of all, at the least total error, as
+    SwAV assigns prototypes (Caron et al. 2020).
+    """
+    plan = errors.T / (-SHARPNESS * errors.mean().clamp_min(1e-12))
+    for _ in range(ROUNDS):
+        plan = plan - plan.logsumexp(0, keepdim=True)
+        plan = plan - plan.logsumexp(1, keepdim=True)
+    return plan.argmax(1)
+
+
+def hard_labels(errors: Float[Tensor, "sub_skills steps"], config: DmilConfig) -> Int[Tensor, " steps"]:
+    """Return the sub-skill that should act at each step, balanced or not."""
+    return sub_skill_labels(errors) if config.balance == "none" else balanced_labels(errors)
+
+
 def targets_of(errors: Float[Tensor, "sub_skills steps"], config: DmilConfig, *, inner: bool) -> Targets:
     """Return what the high level should predict; in the outer loop, the reference's labels are hard."""
     if config.em == "hard" or (config.em == "reference_soft" and not inner):
-        return sub_skill_labels(errors)
+        return hard_labels(errors, config)
     return soft_labels(errors, config.posterior_deviation, transposed=config.em == "soft")
 
 

@@ -10,7 +10,7 @@ from dmil_core.losses import Steps, bank_errors, sub_skill_labels
 from dmil_core.methods.base import TaskGradient
 from dmil_core.methods.dmil.adaptation import Hierarchy, choose, high_level_gradient, inner_loop, sub_skill_gradients
 from dmil_core.methods.dmil.config import DmilConfig
-from dmil_core.methods.dmil.losses import continuity_loss, targets_of
+from dmil_core.methods.dmil.losses import continuity_loss, hard_labels, targets_of
 from dmil_core.networks import Parameters, zeros_like
 
 
@@ -21,23 +21,27 @@ def task_gradient(
     query_high: Steps,
     query_low: Steps,
     config: DmilConfig,
+    *,
+    on_labels: bool = False,
 ) -> TaskGradient:
     """Return ∇_θ [L_h(λ_h, τ3) + Σ_k L_BC(λ_lk, D_4k)] of one task (Algorithm 1).
 
     λ_h and λ_l come from the dual inner loop on τ1 and τ2; of a level that it does not adapt they are θ. With
     ``config.order == "first"`` the gradient is taken at the adapted parameters (FOMAML, Finn et al. 2017). With
     ``"second"`` it is exact: each inner step's Jacobian I − αH pulls it back to θ, the last step first. Targets and
-    choices have no gradient, so each network's steps are a chain of their own.
+    choices have no gradient, so each network's steps are a chain of their own. With `on_labels` D_4k are the states
+    with the label k.
     """
     second, rate = config.order == "second", config.inner_learning_rate
-    loop = inner_loop(Hierarchy.of(parameters), support_high, support_low, config, keep=second)
+    loop = inner_loop(Hierarchy.of(parameters), support_high, support_low, config, keep=second, on_labels=on_labels)
     path = list(itertools.islice(loop, config.inner_steps))
     high, low = path[-1].adapted
 
     errors = bank_errors(low, query_high)
     of_high = high_level_gradient(high, query_high, targets_of(errors, config, inner=False), config)
     chosen = choose(high, query_low.states)
-    of_low = sub_skill_gradients(low, query_low, chosen)
+    own = hard_labels(bank_errors(low, query_low), config) if on_labels else chosen
+    of_low = sub_skill_gradients(low, query_low, own)
 
     gradient, views = zeros_like(parameters)
     vector = Hierarchy.of(views)

@@ -1,5 +1,6 @@
 """DMIL as a method: what it draws, its gradient and its adaptation."""
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -34,6 +35,7 @@ class Dmil(MetaLearner[DmilConfig, TaskBatch]):
     def sample(self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator) -> TaskBatch:
         """Draw τ1 to τ4."""
         batch = sample_task_batch(demonstrations, self.config.trajectories, self.config.window, rng)
+        batch = dataclasses.replace(batch, on_labels=iteration < self.config.labels_until)
         return with_path(self, batch, demonstrations, rng)
 
     def task_gradient(self, parameters: Parameters, batch: TaskBatch) -> TaskGradient:
@@ -42,7 +44,7 @@ class Dmil(MetaLearner[DmilConfig, TaskBatch]):
             Steps.of(demonstrations, self.normalise) for demonstrations in batch.sets
         )
         gradient = meta_gradient.task_gradient(
-            parameters, support_high, support_low, query_high, query_low, self.config
+            parameters, support_high, support_low, query_high, query_low, self.config, on_labels=batch.on_labels
         )
         return with_path_gradient(self, gradient, parameters, batch)
 
@@ -52,6 +54,7 @@ class Dmil(MetaLearner[DmilConfig, TaskBatch]):
         if fine_tuning.optimiser == "adam":
             adapted = adaptation.adapt_by_adam(hierarchy, steps, self.config, fine_tuning)
         else:
-            config = self.config.model_copy(update={"inner_learning_rate": fine_tuning.learning_rate})
+            changes = {"inner_learning_rate": fine_tuning.learning_rate, "balance": "none"}
+            config = self.config.model_copy(update=changes)
             adapted = adaptation.adapt(hierarchy, steps, steps, config, steps=fine_tuning.steps)
         return DmilPolicy(adapted, self.normalise, guide_of(self, parameters, support))

@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from dmil_core.losses import behaviour_cloning_loss, differentiated, squared_errors, sub_skill_labels
 from dmil_core.methods.dmil.losses import (
+    balanced_labels,
     continuity_loss,
     cross_entropy,
     high_level_loss,
@@ -192,3 +193,25 @@ def test_the_reference_continuity_loss_is_the_count() -> None:
     counts = [sum(a != b for a, b in itertools.pairwise(own)) / len(own) for own in (chosen[:3], chosen[3:])]
     assert got.value.item() == pytest.approx(plain.value.item() + 0.5 * sum(counts) / 2)
     assert torch.equal(got.gradient, plain.gradient)
+
+
+def test_balanced_labels_leave_no_sub_skill_without_states() -> None:
+    """One fits a little better everywhere; the others get the states where they lose least."""
+    errors = 1 + 0.1 * normal(SUB_SKILLS, 90).abs()
+    errors[0] -= 0.4
+    assert torch.bincount(sub_skill_labels(errors), minlength=SUB_SKILLS).tolist() == [90, 0, 0]
+    labels = balanced_labels(errors)
+    assert torch.bincount(labels, minlength=SUB_SKILLS).min() >= 20
+    order = torch.tensor([2, 0, 1])
+    assert torch.equal(order[balanced_labels(errors[order])], labels), "their numbers do not matter"
+    lost = errors.gather(0, labels[None]).sum() - errors.min(0).values.sum()
+    even = torch.arange(90) % SUB_SKILLS
+    assert lost < 0.8 * (errors.gather(0, even[None]).sum() - errors.min(0).values.sum())
+
+
+def test_where_all_have_their_part_balanced_labels_are_the_best_fitting_ones() -> None:
+    errors = torch.full((SUB_SKILLS, 30), 2.0)
+    best = torch.arange(30) % SUB_SKILLS
+    errors[best, torch.arange(30)] = 0.1
+    assert torch.equal(balanced_labels(errors), best)
+    assert torch.equal(balanced_labels(torch.zeros(SUB_SKILLS, 3)), torch.zeros(3, dtype=torch.int64))

@@ -12,6 +12,7 @@ from torch.nn import functional
 from benchmarks.masked_reference import MaskedReference, Sets
 from dmil_core.losses import Steps
 from dmil_core.methods.dmil.config import DmilConfig
+from dmil_core.methods.dmil.losses import hard_labels
 from dmil_core.methods.dmil.meta_gradient import task_gradient
 from dmil_core.networks import BLOCK, flatten, unflatten
 from dmil_core.outer_loop import tree_sum
@@ -254,3 +255,36 @@ def test_tree_sum_takes_its_order_from_the_terms_alone() -> None:
     large, one = torch.tensor([1e8]), torch.tensor([1.0])
     assert tree_sum([large, one, -large, one]).item() == 0
     assert tree_sum([large, -large, one, one]).item() == 2
+
+
+@pytest.mark.parametrize("balance", ["none", "sinkhorn"])
+def test_on_labels_each_sub_skill_descends_where_it_has_the_label(make_parameters, sets, balance) -> None:
+    """Against automatic differentiation through one inner step; the labels have no gradient."""
+    config = settings(3, inner_steps=1, continuity_weight=0.0, order="second", balance=balance)
+    parameters = make_parameters(3, 3, dtype=torch.float64)
+    first, support, third, query = sets
+    got = task_gradient(parameters, first, support, third, query, config, on_labels=True)
+    theta = {name: tensor.clone().requires_grad_() for name, tensor in parameters.items()}
+
+    def loss(values, steps: Steps) -> torch.Tensor:
+        predictions = []
+        for k in range(3):
+            outputs, layers = steps.states, [t[k] for n, t in values.items() if n.startswith("low")]
+            for weight, bias in zip(layers[::2], layers[1::2], strict=True):
+                outputs = functional.linear(outputs, weight, bias)
+                outputs = outputs if weight is layers[-2] else functional.relu(outputs)
+            predictions.append(outputs)
+        errors = torch.stack([(own - steps.actions).square().sum(1) for own in predictions])
+        labels = hard_labels(errors.detach(), config)
+        return torch.stack([errors[k][labels == k].mean() for k in labels.unique().tolist()]).sum()
+
+    low = {name: tensor for name, tensor in theta.items() if name.startswith("low")}
+    inner = torch.autograd.grad(loss(low, support), list(low.values()), create_graph=True)
+    adapted = {
+        name: tensor - config.inner_learning_rate * slope
+        for (name, tensor), slope in zip(low.items(), inner, strict=True)
+    }
+    wanted = torch.autograd.grad(loss(adapted, query), list(low.values()))
+    views = unflatten(got.gradient, {name: tensor.shape for name, tensor in parameters.items()})
+    for name, gradient in zip(low, wanted, strict=True):
+        torch.testing.assert_close(views[name], gradient, rtol=1e-9, atol=1e-12)
