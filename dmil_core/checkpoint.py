@@ -262,9 +262,14 @@ def read_sealed(folder: Path, name: str, marker: str, most: int, model: type[Mod
 
 
 def checkpoints_in(folder: Path) -> list[Path]:
-    """Return the checkpoints' folders in `folder`, oldest first."""
+    """Return the checkpoints' folders in `folder`, oldest first; what has another name is none."""
     found = (path for path in folder.glob("iteration-*") if re.fullmatch(NAMED, path.name))
-    return sorted(path for path in found if path.is_dir())
+    return sorted((path for path in found if path.is_dir()), key=iteration_of)
+
+
+def iteration_of(path: Path) -> int:
+    """Return the iteration that the folder of a checkpoint is named by."""
+    return int(path.name.partition("-")[2])
 
 
 def inside_run(folder: Path, path: Path) -> Path:
@@ -289,19 +294,25 @@ def newest(folder: Path, warn: Callable[[str], object]) -> Checkpoint:
     Raises:
         CheckpointError: if there is none.
     """
-    paths = checkpoints_in(folder)
+    checkpoint, complaints = newest_whole(folder)
+    if checkpoint is None:
+        damaged = f"{len(complaints)} checkpoints, none of them whole" if complaints else "no checkpoint"
+        advice = "put a whole one there, or remove them and begin anew" if complaints else "train first"
+        raise CheckpointError("\n".join([f"{folder}: got {damaged}; wanted one; {advice}", *complaints]))
+    if complaints:
+        warn(f"{' | '.join(complaints)}; taking {checkpoint.path} instead")
+    return checkpoint
+
+
+def newest_whole(folder: Path) -> tuple[Checkpoint | None, list[str]]:
+    """Read the newest checkpoint in `folder` that is whole, if any is; return also what is wrong with newer ones."""
     complaints: list[str] = []
-    for path in reversed(paths):
+    for path in reversed(checkpoints_in(folder)):
         try:
-            checkpoint = Checkpoint(inside_run(folder, path))
+            return Checkpoint(inside_run(folder, path)), complaints
         except CheckpointError as error:
             complaints.append(" ".join(str(error).splitlines()))
-        else:
-            if complaints:
-                warn(f"{' | '.join(complaints)}; taking {path} instead")
-            return checkpoint
-    damaged = f"{len(paths)} checkpoints, none of them whole" if paths else "no checkpoint"
-    raise CheckpointError("\n".join([f"{folder}: got {damaged}; wanted one; start the run anew", *complaints]))
+    return None, complaints
 
 
 def opened(path: Path, warn: Callable[[str], object]) -> Checkpoint:

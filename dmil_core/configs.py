@@ -4,13 +4,24 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, SerializeAsAny, model_validator
 
 from dmil_core.fine_tuning import FineTuning, Optimiser
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.registry import config_type
 from dmil_core.points import Points
-from dmil_core.settings import ContextConfig, Count, MethodConfig, NotNegative, Positive, Seed, Settings, Size
+from dmil_core.settings import (
+    ContextConfig,
+    Count,
+    Flag,
+    MethodConfig,
+    NotNegative,
+    Positive,
+    Seed,
+    Settings,
+    Size,
+    without_doubles,
+)
 
 SuiteName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]*$")]
 DEFAULT_METHOD = "dmil"
@@ -27,7 +38,7 @@ class SuiteConfig(Settings):
     protocol: Literal["paper", "benchmark"] = "paper"
     """Steps in an episode of Meta-World: 300, or 500 as in its own evaluation. In both it is a success if the task is
     solved at any of them."""
-    goal_visible: bool = True
+    goal_visible: Flag = True
     """Whether a policy sees where the goal is; Meta-World's own meta-learning benchmarks hide it."""
     start_noise: NotNegative = 1.0
     """Spread of the initial states of a kitchen's episodes: 1 is that of its real demonstrations."""
@@ -36,9 +47,9 @@ class SuiteConfig(Settings):
     points: Points | None = None
     """Which numbers of an observation are positions, in place of what the suite declares; of use for methods that work
     with differences of them."""
-    train_tasks: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    train_tasks: Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(without_doubles)] | None = None
     """Use these meta-training tasks instead of all of the suite's."""
-    test_tasks: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    test_tasks: Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(without_doubles)] | None = None
     """Use these meta-testing tasks instead of all of the suite's."""
 
 
@@ -61,7 +72,7 @@ class DemonstrationConfig(Settings):
     """Standard deviation of the noise added to the action that the expert's environment executes."""
     labels: Literal["clean", "noisy"] = "clean"
     """Action that is stored: clean is the expert's own, noisy the executed one."""
-    trailing_steps: Annotated[int, Field(ge=0, le=10**9)] = 10
+    trailing_steps: Annotated[int, Field(ge=0, le=10**9, strict=True)] = 10
     """Steps recorded after the task is solved."""
     longest: Size | Literal["reference"] | None = None
     """Steps after which an attempt fails; reference: the limits of the authors' released code, 100 for most tasks;
@@ -86,7 +97,7 @@ class DemonstrationConfig(Settings):
 class TrainingConfig(Settings):
     """The outer loop."""
 
-    iterations: Annotated[int, Field(ge=0, le=10**9)] = 2000
+    iterations: Annotated[int, Field(ge=0, le=10**9, strict=True)] = 2000
     """Outer steps."""
     tasks_per_iteration: Size = 10
     """Tasks in a batch, sampled without replacement where there are enough."""
@@ -114,20 +125,20 @@ Control = Literal["no-adaptation", "other-support", "shuffled-actions", "nearest
 class EvaluationConfig(Settings):
     """Few-shot adaptation and its test episodes."""
 
-    shots: Annotated[tuple[Size, ...], Field(min_length=1, max_length=100)] = (1, 3)
+    shots: Annotated[tuple[Size, ...], Field(min_length=1, max_length=100), AfterValidator(without_doubles)] = (1, 3)
     """Sizes of the support set."""
     episodes: Size = 20
     """Episodes of each task for each size (Table 4)."""
     support_draws: Size = 4
     """Disjoint support sets of each task, over which its episodes are spread."""
-    fine_tuning_steps: Annotated[int, Field(ge=0, le=10**9)] = 50
+    fine_tuning_steps: Annotated[int, Field(ge=0, le=10**9, strict=True)] = 50
     """Steps of adaptation to the support set (E.4)."""
     learning_rate: Positive = 1e-2
     """Learning rate of adaptation (E.4)."""
     optimiser: Optimiser = "sgd"
     """sgd takes plain steps on the whole support set, as the inner loop does; adam takes Adam's on batches of 128
     states, at a rate that falls along a cosine, for methods that fine-tune networks."""
-    displaced: Annotated[int, Field(ge=0, le=10_000)] = 0
+    displaced: Annotated[int, Field(ge=0, le=10_000, strict=True)] = 0
     """Copies of the support set with object and goal displaced, to fine-tune on besides; only where a suite declares
     points."""
     controls: tuple[Control, ...] = ()

@@ -48,6 +48,24 @@ class ForeignFileError(OSError, UserError):
         )
 
 
+def at_home(path: str | Path) -> Path:
+    """Return a path that somebody gave, with ``~`` or ``~user`` in the place where shells know it."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:  # there is no such user
+        return Path(path)
+
+
+def check_folder(folder: Path, mark: str = ".") -> None:
+    """See whether a folder is there still, with the file `mark` in it: what is gone must not be begun anew beside.
+
+    Raises:
+        RunError: if not.
+    """
+    if not (folder / mark).exists():
+        raise RunError(f"{folder}: got no such folder any more; wanted it where it was; put it back, then go on")
+
+
 @contextmanager
 def room_for(path: Path, needed: int) -> Iterator[None]:
     """Write `needed` bytes to `path` inside; its folder need not exist yet.

@@ -1,17 +1,34 @@
 """Bounds of settings, and the bases of a method's own settings."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
+from pydantic_core import PydanticCustomError
 
-Count = Annotated[int, Field(ge=1, le=10**9)]
-Size = Annotated[int, Field(ge=1, le=10_000)]
+# strict: a number as text and true for a number are refused wherever settings come from, in YAML and in JSON alike.
+Count = Annotated[int, Field(ge=1, le=10**9, strict=True)]
+Size = Annotated[int, Field(ge=1, le=10_000, strict=True)]
 """A count of what is held in memory together."""
-Seed = Annotated[int, Field(ge=0, lt=2**63)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Probability = Annotated[float, Field(ge=0, lt=1)]
+Flag = Annotated[bool, Field(strict=True)]
+Seed = Annotated[int, Field(ge=0, lt=2**63, strict=True)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
+Probability = Annotated[float, Field(ge=0, lt=1, strict=True)]
+
+
+T = TypeVar("T")
+
+
+def without_doubles(values: tuple[T, ...]) -> tuple[T, ...]:
+    """Return values of which none stands twice.
+
+    Raises:
+        PydanticCustomError: for any that does: its episodes would be counted twice, and the intervals be too narrow.
+    """
+    if len(set(values)) < len(values):
+        raise PydanticCustomError("doubles", "wanted each once")
+    return values
 
 
 class Settings(BaseModel):
@@ -25,11 +42,11 @@ class MethodConfig(Settings):
 
     name: Any
     """The method."""
-    standardise: bool = True
+    standardise: Flag = True
     """Normalise observations by mean and standard deviation of the meta-training demonstrations."""
     features: Literal["raw", "relative"] = "raw"
     """What networks see of an observation: its numbers, or differences of the points that the suite declares."""
-    absolute_position: bool = False
+    absolute_position: Flag = False
     """Whether relative features hold the hand's own position too."""
 
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
@@ -79,7 +96,7 @@ class ContextConfig(MethodConfig):
     context: Literal["none", "path"] = "none"
     """path: a second network sees where the demonstrated hand goes next, from the nearest support state; it is
     meta-trained beside the others, and its action is part of the policy's."""
-    context_share: Annotated[float, Field(ge=0, le=1)] = 0.5
+    context_share: Annotated[float, Field(ge=0, le=1, strict=True)] = 0.5
     """Part that the path network has in the action, where there is one."""
 
     @property

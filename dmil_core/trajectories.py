@@ -40,6 +40,12 @@ class Episode(Trajectory):
         """Whether the task was solved."""
         return self.solved_at is not None
 
+    @property
+    def fault(self) -> int | None:
+        """The first observation that is not finite, the reset's being 0: a fault of the simulator, not of who acts."""
+        finite = np.isfinite(self.observations).all(axis=1)
+        return None if finite.all() else int(finite.argmin())
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Rollout(Episode):

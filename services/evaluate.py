@@ -60,6 +60,8 @@ def run(arguments: Sequence[str]) -> None:
     assert checkpoint is not None, "without --checkpoint there is nothing that parses"
     config = with_evaluation(checkpoint.manifest.config, args.evaluation)
     if args.tasks is not None:
+        if len(set(args.tasks)) < len(args.tasks):
+            raise UserError(f"--tasks: got {', '.join(args.tasks)}; wanted each once: episodes would count twice")
         if args.promote:
             raise UserError("--promote: got --tasks with it; wanted all of the suite's, by which models are compared")
         config = config.model_copy(update={"suite": config.suite.model_copy(update={"test_tasks": args.tasks})})

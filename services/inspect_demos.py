@@ -1,9 +1,9 @@
 """Show a data set's episodes, and what is wrong with them: a Minari data set, an HDF5 file as D4RL's, an npz file."""
 
 import sys
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -11,10 +11,13 @@ import tyro
 from rich.table import Table
 
 from dmil_core.demonstrations import Demonstration, DemonstrationError
+from dmil_core.errors import RunError
+from dmil_core.files import at_home
 from services.cli.arguments import exit_code, parse
 from services.cli.composition import suite_settings
 from services.cli.progress import Bar, console
-from services.demonstrations.external import FORMS, SUFFIXES, ExternalEpisode, misfits, read_episodes
+from services.demonstrations.external import FORMS, SUFFIXES, ExternalEpisode, misfits, oddities, read_episodes
+from services.demonstrations.layouts import looks_like
 from services.suites.base import TaskSuite
 from services.suites.registry import open_suite
 
@@ -30,17 +33,29 @@ class Arguments:
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Run the program."""
+    """Run the program.
+
+    Raises:
+        RunError: if something is wrong with the data set.
+    """
     args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
     suite = None if args.suite is None else open_suite(suite_settings(args.suite))
     form = args.data.partition(":")[0]
-    place = args.data if form in FORMS else f"{SUFFIXES.get(Path(args.data).suffix, 'minari')}:{args.data}"
+    file = at_home(args.data)
+    if form not in FORMS and file.suffix not in SUFFIXES and file.is_file():
+        raise DemonstrationError(
+            f"{args.data}: got {looks_like(file)}; wanted one of {', '.join(SUFFIXES)}, or the id of a Minari data "
+            "set, see docs/data.md"
+        )
+    place = args.data if form in FORMS else f"{SUFFIXES.get(file.suffix, 'minari')}:{args.data}"
     episodes = read_episodes(place)
     console.print(_table(place, episodes, suite))
     problems = [*_problems(episodes, suite)]
     for problem in problems:
         console.print(problem)
-    console.print(f"{len(problems)} things are wrong" if problems else "nothing is wrong with it")
+    if problems:
+        raise RunError(f"{place}: {len(problems)} things are wrong with {len(episodes)} episodes, see above")
+    console.print("nothing is wrong with it")
 
 
 def _table(place: str, episodes: Sequence[ExternalEpisode], suite: TaskSuite | None) -> Table:
@@ -84,8 +99,15 @@ def _demonstration(episode: ExternalEpisode, index: int, suite: TaskSuite | None
 
 def _problems(episodes: Sequence[ExternalEpisode], suite: TaskSuite | None) -> Iterator[str]:
     """Yield what keeps a data set from being learned from, and what looks like a mistake."""
-    first_with: dict[bytes, int] = {}
+    odd: dict[int, list[str]] = defaultdict(list)
+    for index, oddity in oddities(episodes):
+        odd[index].append(oddity)
     for index, one in enumerate(episodes):
+        yield from (f"episode {index}: {oddity}" for oddity in odd[index])
+        if not one.whole:
+            yield f"episode {index}: its end is not marked; its {len(one.actions)} steps are left out"
+        elif len(one.actions) == 1 and one.problem is None:
+            yield f"episode {index}: a single step"
         try:
             demonstration = _demonstration(one, index, suite)
         except DemonstrationError as error:
@@ -99,9 +121,6 @@ def _problems(episodes: Sequence[ExternalEpisode], suite: TaskSuite | None) -> I
             yield f"episode {index}: the same action at every step"
         if one.success is False:
             yield f"episode {index}: no step is a success"
-        before = first_with.setdefault(one.observations.tobytes() + one.actions.tobytes(), index)
-        if before != index:
-            yield f"episode {index}: the same as episode {before}"
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from dmil_core.errors import RunError, UserError, describe_errors
 from dmil_core.files import append_to, read_file, write_file
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
+from services.distributed.node_info import usable_cpus
 from services.storage.private import bypass_proxies, make_private_folder
 from services.tracking.server import LOGINS, server_command, server_environment
 
@@ -63,7 +64,7 @@ class Arguments:
     mlflow_port: int = 5000
     """Of the MLflow server."""
     cpus: int | None = None
-    """That Ray may use; all of this machine's if not given."""
+    """That Ray may use; all that this process may use if not given."""
     object_store_megabytes: int = 500
     """Of memory, for what Ray's processes share."""
 
@@ -76,20 +77,31 @@ class Started(BaseModel):
     name: str
     pid: int
     began: float
+    ticks: str | None = None
+    """Since the machine's start, which a change of the clock does not move; and the start's own id."""
 
     @staticmethod
     def of(name: str, pid: int) -> "Started":
         """Return the record of a running process."""
-        return Started(name=name, pid=pid, began=psutil.Process(pid).create_time())
+        return Started(name=name, pid=pid, began=psutil.Process(pid).create_time(), ticks=_ticks(pid))
 
     def process(self) -> psutil.Process | None:
         """Return the process, if it still runs."""
         try:
             process = psutil.Process(self.pid)
-            same = process.create_time() == self.began and process.status() != psutil.STATUS_ZOMBIE
-            return process if same else None
+            same = process.create_time() == self.began if self.ticks is None else _ticks(self.pid) == self.ticks
+            return process if same and process.status() != psutil.STATUS_ZOMBIE else None
         except psutil.NoSuchProcess:
             return None
+
+
+def _ticks(pid: int) -> str | None:
+    """Return when a process began, by the kernel's own count, or None where there is no such count."""
+    try:
+        after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return f"{after_name[19]} {Path('/proc/sys/kernel/random/boot_id').read_text().strip()}"
+    except (OSError, IndexError):
+        return None
 
 
 class Record(BaseModel):
@@ -198,9 +210,8 @@ def _servers(settings: Arguments, temporary: Path, dashboard: str, mlflow: str) 
         f"--port={settings.ray_port}", "--dashboard-host=127.0.0.1", f"--dashboard-port={settings.dashboard_port}",
         "--include-dashboard=true", f"--dashboard-agent-listen-port={_free_port()}", f"--temp-dir={temporary / 'ray'}",
         f"--object-store-memory={settings.object_store_megabytes * 10**6}", "--disable-usage-stats",
+        f"--num-cpus={settings.cpus or usable_cpus()}",
     ]  # fmt: skip
-    if settings.cpus is not None:
-        ray.append(f"--num-cpus={settings.cpus}")
     server = server_command(Path.cwd() / "mlartifacts", settings.mlflow_port)
     return [
         Server("mlflow", server, f"{mlflow}/version"),

@@ -16,15 +16,15 @@ from pydantic import ValidationError
 
 from dmil_core.configs import DEFAULT_METHOD, ExperimentConfig
 from dmil_core.errors import UserError, describe_errors
-from dmil_core.files import inside, read_file, write_file
+from dmil_core.files import check_folder, inside, read_file, write_file
 from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import DEFAULT_PRESET, EARLY, defaults_from
 from services.cli.places import announce
-from services.cli.progress import Clock, console
+from services.cli.progress import Clock, aside, console
 from services.demonstrations.store import DATA, open_store
 from services.distributed.ray_runner import RunnerKind, open_runner
 from services.evaluation.summary import summarise
-from services.experiments.experiment import Experiment, OnNonfinite
+from services.experiments.experiment import Experiment, OnNonfinite, changed_settings, check_settings
 from services.experiments.finished_run import FinishedRun
 from services.reporting.end_of_run import PAGE, REPORT, publish, show, write_report
 from services.storage.checkpoints import Checkpoints
@@ -32,13 +32,11 @@ from services.storage.folder_lock import held
 from services.storage.redaction import redacted
 from services.storage.remote import STORAGE
 from services.storage.replication import claim_name, replicated, restored
-from services.storage.run_folders import find_folder, make_folder, new_name
+from services.storage.run_folders import find_folder, make_folder, new_name, resume_command
 from services.tracking.links import database, tracking_uri
 from services.tracking.system import recording_system
 from services.tracking.tracker import Tracker, record_settings
 
-CHANGEABLE = {"iterations", "checkpoint_every", "checkpoints_kept"}
-"""Settings of meta-training that a resumed run may change without becoming another run."""
 MARK = "config.json"
 """What a run's folder is known by."""
 MOST_BYTES = 2**20
@@ -100,6 +98,8 @@ def _carry_out(args: Arguments, folder: Path, experiment: Experiment) -> None:
     config = args.experiment
     checkpoints = Checkpoints(folder / "checkpoints", config.training.checkpoints_kept)
     checkpoint = checkpoints.newest() if checkpoints.all() else None
+    if checkpoint is not None:
+        check_settings(checkpoint, config, folder / MARK)
     clock = Clock()
     write_file(folder, MARK, config.model_dump_json(indent=1) + "\n")
     tracker = Tracker(folder, f"dmil-{config.suite.name}")
@@ -124,19 +124,23 @@ def _carry_out(args: Arguments, folder: Path, experiment: Experiment) -> None:
             evaluation = experiment.evaluate(runner, data, trained, folder)
             controls = experiment.evaluate_controls(runner, data, evaluation, folder)
             clock.lap("evaluate")
+        check_folder(folder, MARK)
         summary = summarise(
             evaluation, seconds=clock.seconds, folder=folder, mlflow_run_id=tracker.run_id, controls=controls
         )
         write_report(summary, folder)
         from services.reporting.run_report import write_run_page  # takes seconds to import: not for --help
 
-        write_run_page(FinishedRun(folder), inside(folder, REPORT) / PAGE)
+        with aside("the run's page"):
+            write_run_page(FinishedRun(folder), inside(folder, REPORT) / PAGE)
         publish(tracker, summary, folder)
         tracker.model(trained.path, experiment.held_out_sets(data)[experiment.tasks[-1][1]][:1])
         status = "FINISHED"
-    except KeyboardInterrupt:
-        status = "KILLED"
-        console.print(f"stopped; to go on: python -m services.meta_train --resume {folder}")
+    except BaseException as error:
+        stopped = isinstance(error, KeyboardInterrupt)
+        status = "KILLED" if stopped else "FAILED"
+        if stopped or (checkpoints.all() and not isinstance(error, UserError)):
+            console.print(f"{'stopped; ' if stopped else ''}to go on: {resume_command(folder)}", soft_wrap=True)
         raise
     finally:
         tracker.close(status)
@@ -178,13 +182,11 @@ def _same_run(before: ExperimentConfig, now: ExperimentConfig) -> None:
     Raises:
         UserError: names the sections that differ.
     """
-    old, new = before.model_dump(exclude={"evaluation"}), now.model_dump(exclude={"evaluation"})
-    for setting in CHANGEABLE:
-        del old["training"][setting], new["training"][setting]
-    if changed := [section for section in old if old[section] != new[section]]:
+    if changed := changed_settings(before, now):
         raise UserError(
             f"--resume: got other settings of {', '.join(changed)} than the run began with; wanted the same, except "
-            f"for evaluation and training's {', '.join(sorted(CHANGEABLE))}; start a new run for others"
+            "for those of evaluation and training's iterations, checkpoint_every and checkpoints_kept; start a new run "
+            "for others"
         )
 
 

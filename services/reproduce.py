@@ -19,7 +19,7 @@ from services.distributed.failures import Failure, read_failure
 from services.distributed.runner import LocalRunner
 from services.distributed.simulation_worker import SimulationWorker
 from services.distributed.work_items import AdaptationRollouts, ExpertAttempts
-from services.experiments.experiment import Experiment
+from services.experiments.experiment import Experiment, check_data
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,7 @@ def _slot(failure: Failure, experiment: Experiment) -> Callable[[], object]:
     data = experiment.collect(LocalRunner(experiment.suite))
     sets = experiment.training_sets(data)
     checkpoint, config = _checkpoint(failure), failure.config
+    check_data(checkpoint, data, experiment.store)
     method, parameters = checkpoint.method(experiment.suite.action_dim), checkpoint.tensors()
     assert isinstance(method, MetaLearner)
     iteration = int(failure.piece["iteration"])
@@ -65,8 +66,9 @@ def _slot(failure: Failure, experiment: Experiment) -> Callable[[], object]:
 
 def _adaptation(failure: Failure, experiment: Experiment) -> Callable[[], object]:
     runner = LocalRunner(experiment.suite)
-    evaluator = experiment.evaluator(runner, experiment.collect(runner))
-    items = evaluator.items(_checkpoint(failure), AdaptationRollouts)
+    data, checkpoint = experiment.collect(runner), _checkpoint(failure)
+    check_data(checkpoint, data, experiment.store)
+    items = experiment.evaluator(runner, data).items(checkpoint, AdaptationRollouts)
     (item,) = (item for item in items if item.key == failure.piece)
     return lambda: list(runner.simulate([item]))
 

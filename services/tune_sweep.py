@@ -26,7 +26,7 @@ from services.distributed.ray_runner import open_runner
 from services.experiments.experiment import Experiment
 from services.storage.folder_lock import held
 from services.storage.provenance import git_commit, library_versions
-from services.storage.run_folders import find_folder, new_name
+from services.storage.run_folders import find_folder, new_name, resume_command
 from services.suites.registry import open_suite
 from services.sweeps.folders import MARK, SweepFolder, SweepRecord
 from services.sweeps.settings import Preset, Sweep, planned
@@ -101,7 +101,7 @@ def _carry_out(sweep: SweepFolder) -> None:
         status = "FINISHED"
     except KeyboardInterrupt:
         status = "KILLED"
-        console.print(f"stopped; to go on: python -m services.tune_sweep --resume {sweep.path}")
+        console.print(f"stopped; to go on: {resume_command(sweep.path, 'tune-sweep')}", soft_wrap=True)
         raise
     finally:
         tracker.close(status)
@@ -112,7 +112,7 @@ def _carry_out(sweep: SweepFolder) -> None:
     if failed := [name for name in sweep.trials if (result := sweep.result(name)) and result.status == "failed"]:
         raise RunError(
             f"{len(failed)} of {len(sweep.trials)} trials failed, see above; the others are in the table; to try them "
-            f"again: python -m services.tune_sweep --resume {sweep.path}"
+            f"again: {resume_command(sweep.path, 'tune-sweep')}"
         )
 
 

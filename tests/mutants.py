@@ -77,7 +77,7 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
     },
     ("dmil_core/checkpoint.py", "services/storage/test_checkpoints.py"): {
         'exclude={"loss", "mlflow_run_id", ': 'exclude={"loss", ',
-        "for path in reversed(paths)": "for path in paths",
+        "for path in reversed(checkpoints_in(folder))": "for path in checkpoints_in(folder)",
     },
     ("services/storage/checkpoints.py", "services/storage/test_checkpoints.py"): {
         " and path != best": "",

@@ -1,19 +1,25 @@
 """What all programs share: settings from a preset, a YAML file and flags, and errors that teach."""
 
 import argparse
+import dataclasses
+import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import tyro
 from pydantic import ValidationError
 
 from dmil_core.errors import RunError, UserError, describe_errors
+from dmil_core.files import at_home
 from services.cli.escapes import for_terminal
 from services.cli.progress import console_logging
+from services.cli.stopping import stoppable
+from services.cli.streams import steady_streams
+from services.storage.redaction import redacted
 
 T = TypeVar("T")
 Quiet = Annotated[
@@ -24,6 +30,8 @@ Quiet = Annotated[
     ),
 ]
 """The flag ``--quiet`` of programs that take long; `exit_code` applies it."""
+LISTS = {"demos"}
+"""Options that may be given several times, which makes a list."""
 PROGRAMS = {
     "meta-train": "collect demonstrations, meta-train, evaluate",
     "collect-demos": "let the scripted experts make demonstrations",
@@ -42,8 +50,10 @@ def peek(arguments: Sequence[str], **options: Callable[[str], Any]) -> argparse.
     """Return some of the options, each converted by its function, which decide the defaults of all others."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name, kind in options.items():
-        parser.add_argument(f"--{name}", type=kind)
-    return parser.parse_known_args(arguments)[0]
+        parser.add_argument(f"--{name}", type=at_home if kind is Path else kind, action="append")
+    given = vars(parser.parse_known_args(arguments)[0])
+    last = {name: values and (",".join(values) if name in LISTS else values[-1]) for name, values in given.items()}
+    return argparse.Namespace(**last)
 
 
 def parse(program: type[T], description: str, arguments: Sequence[str], defaults: T) -> T:
@@ -54,7 +64,7 @@ def parse(program: type[T], description: str, arguments: Sequence[str], defaults
     """
     module = program.__module__ if program.__module__ != "__main__" else f"services.{Path(sys.argv[0]).stem}"
     try:
-        return tyro.cli(
+        read = tyro.cli(
             program,
             config=(tyro.conf.AvoidSubcommands,),
             prog=f"python -m {module}",
@@ -64,31 +74,40 @@ def parse(program: type[T], description: str, arguments: Sequence[str], defaults
         )
     except ValidationError as error:
         raise UserError(describe_errors(error)) from error
+    paths = {name: at_home(value) for name, value in vars(read).items() if isinstance(value, Path)}
+    return dataclasses.replace(read, **paths)  # type: ignore[type-var]  every program's is a dataclass
 
 
 def exit_code(program: Callable[[Sequence[str]], None], arguments: Sequence[str]) -> int:
     """Run a program, with what is logged on the console, and return its exit code.
 
-    2 for the user's mistake, 1 for what stops a run otherwise, 130 and 143 for Ctrl-C and SIGTERM.
+    2 for the user's mistake, 1 for what stops a run otherwise, 129, 130 and 143 for SIGHUP, Ctrl-C and SIGTERM.
     """
-    received: list[int] = []
-
-    def terminate(number: int, frame: object) -> NoReturn:
-        received.append(number)
-        raise KeyboardInterrupt  # as Ctrl-C; of a class of our own nothing would be left where Ray waits
-
-    before = signal.signal(signal.SIGTERM, terminate)
-    try:
-        with console_logging(quiet="--quiet" in arguments):
-            program(arguments)
-    except (UserError, RunError) as error:
-        print(f"error: {for_terminal(str(error))}", file=sys.stderr)
-        return 2 if isinstance(error, UserError) else 1
-    except KeyboardInterrupt:
-        return 143 if received else 130
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    with steady_streams(), stoppable() as received:
+        try:
+            with console_logging(quiet="--quiet" in arguments):
+                program(arguments)
+        except (UserError, RunError, OSError) as error:
+            if (told := _told(error)) is None:
+                raise
+            print(f"error: {for_terminal(told)}", file=sys.stderr)
+            return 2 if isinstance(error, UserError) else 1
+        except KeyboardInterrupt:
+            return 128 + (received or [signal.SIGINT])[0]
     return 0
+
+
+def _told(error: Exception) -> str | None:
+    """Return what is told of an error in place of its traceback, or None for one of the program itself.
+
+    A file that cannot be read or written is the machine's: a full or read-only disk, a folder in a file's place.
+    """
+    if isinstance(error, UserError | RunError):
+        return str(error)
+    if not isinstance(error, OSError) or error.filename is None:
+        return None
+    path = redacted(os.fsdecode(error.filename)) if isinstance(error.filename, str | bytes) else str(error.filename)
+    return f"{path}: got {error.strerror}; wanted what can be read and written; mend that, or give another place"
 
 
 def main() -> None:

@@ -85,7 +85,8 @@ def suite_settings(suite: str, tasks: Sequence[str] | None = None) -> SuiteConfi
     try:
         return SuiteConfig.model_validate({"name": suite, "train_tasks": tasks, "test_tasks": tasks})
     except ValidationError as error:
-        raise _no_name(suite) from error
+        named = all(problem["loc"] == ("name",) for problem in error.errors())
+        raise _no_name(suite) if named else UserError(f"--tasks: {describe_errors(error, separator='; ')}") from error
 
 
 def _no_name(suite: str | None) -> UserError:

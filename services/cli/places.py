@@ -1,5 +1,6 @@
 """Where results will lie: reported before the work begins, and refused where somebody else will delete them."""
 
+import os
 import re
 from pathlib import Path
 
@@ -10,6 +11,10 @@ RAY_FOLDER = re.compile(r"/(runtime_resources/\w+|session_\d{4}-\d\d-\d\d_[\d_-]
 """What lies in it goes with its Ray cluster, or sooner: the packages of jobs, and a session's own files."""
 
 
+MLFLOW = "MLflow"
+"""What stops no run, wherever it is."""
+
+
 def announce(**places: tuple[Path | None, str]) -> None:
     """Print where results will lie, as absolute paths.
 
@@ -18,7 +23,8 @@ def announce(**places: tuple[Path | None, str]) -> None:
             another, as ``--runs FOLDER`` or ``DMIL_DATA=FOLDER``.
 
     Raises:
-        UserError: if one is in Ray's own folder, as in a job with ``--working-dir``; nothing is printed then.
+        UserError: if one is in Ray's own folder, as in a job with ``--working-dir``, or where nothing can be, as below
+            a file; nothing is printed then.
     """
     resolved = {what: path.resolve() for what, (path, _) in places.items() if path is not None}
     if passing := [what for what, path in resolved.items() if RAY_FOLDER.search(str(path))]:
@@ -30,4 +36,15 @@ def announce(**places: tuple[Path | None, str]) -> None:
             """'{"env_vars": {"NAME": "VALUE"}}'"""
         )
     for what, path in resolved.items():
+        if what != MLFLOW and (why := _misplaced(path, how := places[what][1])):
+            raise UserError(f"{what}: got {path}, where {why}; wanted a place for it: {how}")
+    for what, path in resolved.items():
         console.print(f"{what}: {path}", soft_wrap=True)
+
+
+def _misplaced(path: Path, how: str) -> str | None:
+    """Return why nothing can be written to `path`, which is given by `how`, or None; who only reads there may read."""
+    there = next(place for place in (path, *path.parents) if os.path.exists(place))  # noqa: PTH110  Path's may raise
+    if not there.is_dir() and (there != path or how.endswith("FOLDER")):
+        return f"{there} is no folder"
+    return f"{there} cannot be written to" if how.startswith("--") and not os.access(there, os.W_OK) else None

@@ -15,6 +15,9 @@ from rich.text import Text
 
 from services.cli.escapes import for_terminal
 from services.cli.live_view import Pace, Screen, Status
+from services.storage.redaction import error_line
+
+logger = logging.getLogger(__name__)
 
 LINE_SECONDS = 5.0
 REFRESHES = 2
@@ -39,12 +42,9 @@ class Output(Console):
         return self.is_interactive and self.file.isatty() and not self.plain
 
 
+_ON_TERMINAL = sys.stdout is not None and sys.stdout.isatty()  # None where it was closed before the start
 console = Output(
-    markup=False,
-    emoji=False,
-    highlight=False,
-    soft_wrap=not sys.stdout.isatty(),
-    width=None if sys.stdout.isatty() else 160,
+    markup=False, emoji=False, highlight=False, soft_wrap=not _ON_TERMINAL, width=None if _ON_TERMINAL else 160
 )
 
 
@@ -73,6 +73,15 @@ def console_logging(*, quiet: bool) -> Iterator[None]:
     finally:
         logger.handlers, console.plain = handlers, plain
         logger.setLevel(level)
+
+
+@contextmanager
+def aside(what: str) -> Iterator[None]:
+    """Log an error inside, and go on: the work does not end because of what only shows it."""
+    try:
+        yield
+    except Exception as error:  # noqa: BLE001  whatever it is
+        logger.warning(f"{what} failed ({error_line(error)}); going on without it")
 
 
 class Bar:

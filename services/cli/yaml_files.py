@@ -1,5 +1,6 @@
 """Settings from YAML files: read with care, and put in the place of others."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -58,9 +59,27 @@ def read_yaml(file: Path, flag: str) -> dict[Any, Any]:
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """Refuses aliases, a few lines of which stand for more than any memory holds, and deep nesting."""
+    """Reads plain values by the rules of YAML 1.2, where yes, 1:30 and 2024-01-01 are text, and 010 is no number.
+
+    It refuses keys that stand twice, aliases, a few lines of which stand for more than any memory holds, and deep
+    nesting.
+    """
 
     depth = 0
+    yaml_implicit_resolvers = {}  # noqa: RUF012  none of YAML 1.1's
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Leave the key ``<<`` what it is."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        values = super().construct_mapping(node, deep)
+        if len(values) < len(node.value):
+            keys = [self.construct_object(key, True) for key, _ in node.value]
+            second = next(index for index, key in enumerate(keys) if key in keys[:index])
+            raise yaml.MarkedYAMLError(
+                problem=f"found the key {keys[second]} twice", problem_mark=node.value[second][0].start_mark
+            )
+        return values
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent) or self.depth == DEEPEST:
@@ -72,6 +91,16 @@ class _PlainLoader(yaml.SafeLoader):
         node = super().compose_node(parent, index)
         self.depth -= 1
         return node
+
+
+for _tag, _form, _first in (
+    ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
+    ("int", r"[-+]?(0|[1-9][0-9]*)|0o[0-7]+|0x[0-9a-fA-F]+", "-+0123456789"),
+    ("float", r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+     "-+.0123456789"),
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+):  # fmt: skip
+    _PlainLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(rf"^(?:{_form})$"), list(_first))
 
 
 def _cut(text: str) -> str:

@@ -1,29 +1,36 @@
 """Demonstrations that somebody else has recorded: Minari data sets, D4RL's HDF5 files, npz files (docs/data.md)."""
 
+import logging
+import os
 import re
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32
-from minari.storage import get_dataset_path
 from pydantic import BaseModel, Field
 
 from dmil_core.demonstrations import Demonstration, DemonstrationError, digest
 from dmil_core.errors import shorten
-from dmil_core.files import ForeignFileError, inside, named, read_file
+from dmil_core.files import ForeignFileError, at_home, inside, named, read_file
 from services.demonstrations.hdf5 import PlainFile, open_plain
 from services.demonstrations.layouts import looks_like, read_lerobot, read_pair, read_robomimic
-from services.demonstrations.npz import read_npz
+from services.demonstrations.npz import read_arrays
 from services.demonstrations.store import TaskDemonstrations, data_root
 from services.suites.base import TaskSuite
+from services.suites.registry import NAME
+
+logger = logging.getLogger(__name__)
 
 FORMS = ("minari", "hdf5", "npz", "npy", "lerobot")
 """What data sets may be: an id of Minari's, a file as D4RL or robomimic has them, a file of arrays or a folder of such,
 two files of one array each, the folder of a LeRobot data set."""
 SUFFIXES = {".npz": "npz", ".hdf5": "hdf5", ".h5": "hdf5"}
 """The form that a file's name stands for."""
+MOST_NUMBER = 1e6
+"""In a demonstration: what is larger is damage, or another unit."""
 MAX_METADATA = 2**20
 """Bytes of a Minari data set's metadata."""
 VERSION = re.compile(r"-v\d+$")
@@ -47,28 +54,36 @@ class ExternalEpisode(NamedTuple):
     """The sum over the episode, where rewards are recorded."""
     success: bool | None
     """Whether some step was a success by its info, where that is recorded."""
+    problem: str | None = None
+    """In words, why it cannot have been meant as it reads."""
+    whole: bool = True
+    """Whether its end is marked; else it is left out."""
 
 
 def places_of(source: str) -> dict[str, str]:
-    """Return where the demonstrations of each task are, from ``minari:ID,TASK=ID`` and the like.
+    r"""Return where the demonstrations of each task are, from ``minari:ID,TASK=ID,npz:TASK=PATH`` and the like.
+
+    The task is what stands before the first ``=``, if that can be a task's name; ``\,`` is a comma in a path.
 
     Raises:
         DemonstrationError: for another form, or a task named twice.
     """
-    form, colon, rest = source.partition(":")
-    if not colon and Path(source).exists():
-        form = SUFFIXES.get(Path(source).suffix, "npz" if Path(source).is_dir() else "")
-        proposal = f"{form}:{source}" if form else f"a form that is read: it looks like {looks_like(Path(source))}"
+    if ":" not in source and (there := at_home(source)).exists():
+        form = SUFFIXES.get(there.suffix, "npz" if there.is_dir() else "")
+        proposal = f"{form}:{source}" if form else f"a form that is read: it looks like {looks_like(there)}"
         raise DemonstrationError(f"demonstrations.source: got {source}; wanted {proposal}")
-    if form not in FORMS or not all(rest.split(",")):
-        raise DemonstrationError(
-            f"demonstrations.source: got {source}; wanted expert, or one of {', '.join(FORMS)} and a list: "
-            "minari:ID,ID, each with TASK= before it where its last part is not the task's name"
-        )
-    places: dict[str, str] = {}
-    for part in rest.split(","):
-        task, _, place = part.rpartition("=")
-        task = task or VERSION.sub("", Path(place.partition("#")[0].partition("+")[0]).stem)
+    form, places = "", dict[str, str]()
+    for part in (part.replace(r"\,", ",") for part in re.split(r"(?<!\\),", source)):
+        named_form, _, rest = part.partition(":")
+        form, part = (named_form, rest) if named_form in FORMS else (form, part)
+        task, equals, place = part.partition("=")
+        if not equals or not NAME.fullmatch(task):
+            task, place = VERSION.sub("", Path(part.partition("#")[0].partition("+")[0]).stem), part
+        if not form or not place:
+            raise DemonstrationError(
+                f"demonstrations.source: got {source}; wanted expert, or one of {', '.join(FORMS)} and a list: "
+                "minari:ID,ID, each with TASK= before it where its last part is not the task's name"
+            )
         if task in places:
             raise DemonstrationError(f"demonstrations.source: got the task {task} twice; wanted one data set for each")
         places[task] = f"{form}:{place}"
@@ -85,13 +100,15 @@ def read_episodes(place: str) -> list[ExternalEpisode]:
     Raises:
         DemonstrationError: names the data set, and what of it cannot be read.
     """
-    form, _, path = place.partition(":")
+    form, _, name = place.partition(":")
+    path = at_home(name)
     if form == "npz":
-        return [ExternalEpisode(one.observations, one.actions, None, None) for one in _read_npz(Path(path))]
+        return _plain(_read_npz(path))
     try:
         if form in ("npy", "lerobot"):
-            return _plain(read_pair(path) if form == "npy" else read_lerobot(Path(path)))
-        return _read_minari(path) if form == "minari" else _read_hdf5(path)
+            parts = "+".join(str(at_home(part)) for part in name.split("+"))
+            return _plain(read_pair(parts) if form == "npy" else read_lerobot(path))
+        return _read_minari(name) if form == "minari" else _read_hdf5(str(path))
     except (DemonstrationError, ForeignFileError) as error:
         raise DemonstrationError(f"{place}: {error}") from error
     # What h5py raises of files that are not what they look like.
@@ -109,8 +126,14 @@ def demonstrations(task: str, place: str, suite: TaskSuite, most: int) -> TaskDe
     """
     state_of = getattr(suite, "state_of", lambda observations: observations)
     kept = []
-    for index, episode in enumerate(read_episodes(place)[:most]):
+    episodes = read_episodes(place)
+    if tail := sum(len(episode.actions) for episode in episodes if not episode.whole):
+        logger.warning(f"{place}: {tail} steps after the last mark of an end are left out")
+    odd = dict(oddities(episodes[:most]))
+    for index, episode in enumerate(episode for episode in episodes[:most] if episode.whole):
         try:
+            if index in odd:
+                raise DemonstrationError(f"{odd[index]}; mend it, or leave it out")
             observations = np.ascontiguousarray(state_of(episode.observations), np.float32)
             demonstration = Demonstration(f"{index:03d}", task, observations, episode.actions)
             check_dimensions(demonstration, suite)
@@ -118,6 +141,23 @@ def demonstrations(task: str, place: str, suite: TaskSuite, most: int) -> TaskDe
             raise DemonstrationError(f"{place}: episode {index}: {error}") from error
         kept.append(demonstration)
     return TaskDemonstrations(place, tuple(kept), 0, digest(kept))
+
+
+def oddities(episodes: Sequence[ExternalEpisode]) -> Iterator[tuple[int, str]]:
+    """Yield the number of an episode, and in words why it cannot have been meant as it reads."""
+    first_with: dict[bytes, int] = {}
+    for index, episode in enumerate(episodes):
+        if episode.problem is not None:
+            yield index, episode.problem
+        if len(episode.actions) > 1 and (episode.observations == episode.observations[0]).all():
+            yield index, "the same state at every step, as of a simulator's own array that was not copied"
+        for field in ("observations", "actions"):
+            far = np.abs(np.nan_to_num(getattr(episode, field), posinf=np.inf)).max(initial=0.0)
+            if MOST_NUMBER < far < np.inf:  # what is not finite is told as that
+                yield index, f"{field}: got {far:.3g}; wanted numbers of at most {MOST_NUMBER:.0e}, in a robot's units"
+        before = first_with.setdefault(episode.observations.tobytes() + episode.actions.tobytes(), index)
+        if before != index:
+            yield index, f"the same as episode {before}"
 
 
 def check_dimensions(demonstration: Demonstration, suite: TaskSuite) -> None:
@@ -141,7 +181,7 @@ def _read_minari(dataset_id: str) -> list[ExternalEpisode]:
     """Read a Minari data set without Minari, which would make the environment that the metadata name."""
     folder = inside(data_root(), dataset_id) / "data"
     if not folder.exists():
-        folder = get_dataset_path(dataset_id) / "data"
+        folder = _minari_root() / dataset_id / "data"
     if not folder.exists():
         raise DemonstrationError(
             f"got nothing at {folder}, nor in {data_root()}; wanted a data set; minari download {dataset_id}"
@@ -151,6 +191,11 @@ def _read_minari(dataset_id: str) -> list[ExternalEpisode]:
         raise DemonstrationError(f"data_format: got {metadata.data_format}; wanted hdf5; store the data set as that")
     with open_plain(folder, "main_data.hdf5") as file:
         return [_episode(file, f"episode_{index}") for index in range(metadata.total_episodes)]
+
+
+def _minari_root() -> Path:
+    """Return where Minari keeps data sets; its own function would make the folder."""
+    return at_home(os.environ.get("MINARI_DATASETS_PATH") or "~/.minari/datasets")
 
 
 def _episode(file: PlainFile, name: str) -> ExternalEpisode:
@@ -185,12 +230,12 @@ def _plain(episodes: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[ExternalEp
         ]
 
 
-def _read_npz(path: Path) -> list[Demonstration]:
+def _read_npz(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
     """Read a file, or all files of a folder in the order of their names."""
     files = sorted(path.glob("*.npz")) if path.is_dir() else [path]
     if not files:
         raise DemonstrationError(f"{path}: got no .npz file in it; it looks like {looks_like(path)}")
-    return [demonstration for file in files for demonstration in read_npz(file, "recorded")]
+    return [episode for file in files for episode in read_arrays(file)]
 
 
 def _read_hdf5(place: str) -> list[ExternalEpisode]:
@@ -217,14 +262,18 @@ def _read_hdf5(place: str) -> list[ExternalEpisode]:
         rewards = file.array("rewards", axes=1) if file.has("rewards") else None
     if not ends.any():
         raise DemonstrationError("got neither terminals nor timeouts that mark an episode's last step; wanted either")
-    cuts = np.flatnonzero(ends) + 1  # what follows the last mark is no whole episode
-    parts = [slice(start, end) for start, end in zip([0, *cuts[:-1].tolist()], cuts.tolist(), strict=True)]
+    cuts = sorted({0, len(ends), *(np.flatnonzero(ends) + 1).tolist()})
+    with np.errstate(over="ignore"):  # what does not fit becomes infinite, and is refused
+        observations, actions = observations.astype(np.float32), actions.astype(np.float32)
+    stays = "a single step after a marked one: an end that stays marked cuts each step off; mark last steps only"
     return [
         ExternalEpisode(
-            observations[part].astype(np.float32),
-            actions[part].astype(np.float32),
-            None if rewards is None else float(rewards[part].sum()),
+            observations[start:end],
+            actions[start:end],
+            None if rewards is None else float(rewards[start:end].sum()),
             None,
+            stays if start and end == start + 1 and ends[start] else None,
+            bool(ends[end - 1]),
         )
-        for part in parts
+        for start, end in pairwise(cuts)
     ]

@@ -65,6 +65,18 @@ def read_npz(path: Path, task: str, obs_dim: int | None = None) -> list[Demonstr
             unpack to more than is sane are refused before they are unpacked.
     """
     try:
+        return [Demonstration(f"{index:03d}", task, *arrays) for index, arrays in enumerate(read_arrays(path, obs_dim))]
+    except DemonstrationError as error:
+        raise DemonstrationError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+
+
+def read_arrays(path: Path, obs_dim: int | None = None) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Read observations and actions of each demonstration, whatever numbers are in them; see `read_npz`.
+
+    Raises:
+        DemonstrationError: names the file, and the array that cannot be used.
+    """
+    try:
         arrays = _read_arrays(read_file(*named(path), MOST_ARCHIVE))
         episodes = episodes_in(arrays["observations"], arrays["actions"], arrays.get("episode_lengths"))
         columns = episodes[0][0].shape[1]
@@ -72,13 +84,8 @@ def read_npz(path: Path, task: str, obs_dim: int | None = None) -> list[Demonstr
             raise DemonstrationError(f"observations: got {columns} columns; wanted the first {obs_dim} of them")
         with np.errstate(over="ignore"):  # what does not fit becomes infinite, and is refused
             return [
-                Demonstration(
-                    f"{index:03d}",
-                    task,
-                    np.ascontiguousarray(observations[:, :obs_dim], np.float32),
-                    np.ascontiguousarray(actions, np.float32),
-                )
-                for index, (observations, actions) in enumerate(episodes)
+                (np.ascontiguousarray(observations[:, :obs_dim], np.float32), np.ascontiguousarray(actions, np.float32))
+                for observations, actions in episodes
             ]
     # What zipfile and numpy raise of damaged files; NotImplementedError and RuntimeError for what they do not read.
     except (

@@ -26,7 +26,7 @@ from dmil_core.checksums import MOST_LISTED, check_listing, write_listing
 from dmil_core.configs import DemonstrationConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError, digest
 from dmil_core.errors import describe_errors
-from dmil_core.files import ForeignFileError, inside, making_folder, open_file, read_file, room_for
+from dmil_core.files import ForeignFileError, at_home, inside, making_folder, open_file, read_file, room_for
 from dmil_core.trajectories import Episode
 from services.storage.redaction import error_line
 from services.storage.remote import Storage, given_storage
@@ -41,6 +41,8 @@ DIGESTS, ARRAYS, METADATA = "SHA256SUMS", "data/main_data.hdf5", "data/metadata.
 MOST_ARRAYS = 2**32
 """Bytes of a data set's file of arrays."""
 MOST_METADATA = 2**20
+UNREADABLE = {errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE, errno.ENOMEM}
+"""Why good data may not be read."""
 FILES = {ARRAYS: MOST_ARRAYS, METADATA: MOST_METADATA}
 
 
@@ -64,7 +66,7 @@ class _Metadata(BaseModel):
 
 def data_root() -> Path:
     """Return ``DMIL_DATA``, or ``data`` in the working directory."""
-    return Path(os.environ.get(DATA) or "data")
+    return at_home(os.environ.get(DATA) or "data")
 
 
 class DemoStore:
@@ -117,6 +119,10 @@ class DemoStore:
         except DemonstrationError as error:
             raise DemonstrationError(f"{path / ARRAYS}: {error}") from error
         except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:  # the last four are h5py's
+            if isinstance(error, OSError) and error.errno in UNREADABLE:
+                raise DemonstrationError(
+                    f"{path}: got {error}; wanted a data set that can be read; mend that"
+                ) from error
             raise self._damaged(path, f"{type(error).__name__}: {error}") from error
         found = digest(demonstrations)
         if metadata.digest != found:

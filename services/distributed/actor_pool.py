@@ -37,6 +37,7 @@ class Pool:
         max_in_flight: int = 1,
         listener: PoolListener | None = None,
         min_size: int | None = None,
+        start_backup: Callable[[], Any] | None = None,
     ) -> None:
         """Start `size` actors and wait until `min_size` are healthy; the others join when the cluster has room.
 
@@ -48,11 +49,14 @@ class Pool:
             max_in_flight: calls sent to an actor at a time. With 2 its next one is at hand when it ends one.
             listener: receives the events of the pool.
             min_size: actors that have room now, all by default.
+            start_backup: returns a new actor that waits for no CPU, which the slow one may hold; `start_actor` by
+                default.
 
         Raises:
             UserError: if the cluster cannot place that many.
         """
         self._start_actor, self._max_in_flight, self._listener = start_actor, max_in_flight, listener or PoolListener()
+        self._start_backup = start_backup or start_actor
         self._workers: list[Worker] = []
         self._starting: dict[ray.ObjectRef, Worker] = {}
         self._queued: list[Call] = []
@@ -171,8 +175,8 @@ class Pool:
 
     # Workers
 
-    def _start_worker(self, number: int) -> Worker:
-        worker = Worker(number, self._start_actor())
+    def _start_worker(self, number: int, start: Callable[[], Any] | None = None) -> Worker:
+        worker = Worker(number, (start or self._start_actor)())
         self._starting[worker.actor.__ray_ready__.remote()] = worker
         return worker
 
@@ -347,7 +351,7 @@ class Pool:
             f"worker {call.worker.number} is slow: {call.label} has taken {seconds:.1f} s, over {TIMEOUT_FACTOR} times "
             "the median; a backup runs it too"
         )
-        call.backup = self._start_worker(-1)
+        call.backup = self._start_worker(-1, self._start_backup)
 
     def _drop_backup(self, call: Call) -> None:
         if call.backup is not None:

@@ -11,7 +11,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dmil_core.errors import UserError
+from dmil_core.errors import RunError, UserError
+from services.distributed.node_info import usable_cpus
 from services.storage.private import bypass_proxies, private_folder
 from services.storage.redaction import error_line, redacted
 
@@ -48,9 +49,9 @@ def joined(workers: int | None = None) -> Iterator[None]:
         if address is None:
             folder = stack.enter_context(private_folder())
             stack.callback(ray.shutdown)
-            ray.init(
+            _start(
                 address="local",
-                num_cpus=max(os.cpu_count() or 1, workers or 0),
+                num_cpus=max(usable_cpus(), workers or 0),
                 include_dashboard=False,
                 job_config=_job_config(),
                 object_store_memory=OBJECT_STORE_BYTES,
@@ -66,6 +67,23 @@ def joined(workers: int | None = None) -> Iterator[None]:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, on_termination)  # Ray puts its own there, which ends at once
         yield
+
+
+def _start(**options: Any) -> None:
+    """Start Ray on this machine.
+
+    Raises:
+        RunError: if it does not come up, as on a machine that is too busy.
+    """
+    import ray
+
+    try:
+        ray.init(**options)
+    except Exception as error:  # Ray raises plain ones
+        raise RunError(
+            f"Ray does not start on this machine: {error_line(error)}; start again, with less beside it, or without "
+            "Ray: --runner local"
+        ) from error
 
 
 def named_address() -> str | None:

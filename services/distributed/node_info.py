@@ -47,11 +47,21 @@ class NodeFacts(NamedTuple):
     """Seconds by which its clock is ahead of the asking machine's, to within a round trip."""
 
 
+def usable_cpus() -> int:
+    """Return how many CPUs this process may use: of its affinity, and of the time that its control group grants."""
+    cpus = len(os.sched_getaffinity(0))
+    try:
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        return max(1, min(cpus, round(int(quota) / int(period))))
+    except (OSError, ValueError):  # there is no limit, or no such file
+        return cpus
+
+
 def facts(runs: str, mark: str, cpus: float | None = None) -> NodeFacts:
     """Return the facts of this machine, whose `cpus` Ray may count otherwise."""
     there = Path(runs).absolute()
     disk = shutil.disk_usage(next(folder for folder in (there, *there.parents) if folder.exists()))
-    cores = len(os.sched_getaffinity(0))
+    cores = usable_cpus()
     drawing, draws = _drawing()
     installed = sorted({f"{package.name}=={package.version}" for package in distributions()})
     return NodeFacts(

@@ -73,13 +73,19 @@ class RayMetaTraining:
         self._meter = meter or Meter()
         self.counter = WorkerCounter("adaptation", self._meter)
         self._workers: Callable[[], int] = workers if callable(workers) else lambda: workers
-        remote, shared = ray.remote(num_cpus=1, num_gpus=gpus)(AdaptationWorker), ray.put(plan.demonstrations)
+        shared = ray.put(plan.demonstrations)
+
+        def start(cpus: int) -> Any:
+            remote = ray.remote(num_cpus=cpus, num_gpus=gpus)(AdaptationWorker)
+            return remote.remote(plan.method, plan.shapes, shared, plan.seed, plan.suite)
+
         self._pool = Pool(
-            lambda: remote.remote(plan.method, plan.shapes, shared, plan.seed, plan.suite),
+            lambda: start(1),
             size=self._wanted_workers,
             max_in_flight=2,
             listener=self.counter,
             min_size=min_workers,
+            start_backup=lambda: start(0),
         )
         self._state = plan.state
         """The state that a new learner starts from."""

@@ -15,6 +15,7 @@ from services.distributed.metrics import Meter, RayMeter, WorkerCounter
 from services.distributed.ray_meta_training import RayMetaTraining
 from services.distributed.runner import LocalRunner, Plan, Runner
 from services.distributed.simulation_worker import SimulationWorker, WorkItem
+from services.storage.redaction import error_line
 from services.suites.base import TaskSuite
 
 if TYPE_CHECKING:
@@ -68,7 +69,11 @@ class RayRunner:
             logger.info(f"--workers {workers}: the cluster has {cpus()} CPUs now; further workers join as it grows")
         self.meter: Meter = RayMeter(suite.name)
         self._counter = WorkerCounter("simulation", self.meter)
-        self._suite = ray.put(suite)
+        try:
+            self._suite = put_suite(suite, ray.put)
+        except UserError:
+            self._cluster.close()
+            raise
         self._background: Pool | None = None
         self._training: RayMetaTraining | None = None
 
@@ -96,12 +101,21 @@ class RayRunner:
         """Spread the items over the simulation workers."""
         # While meta-training pauses, its workers keep their CPUs: the simulation's must not wait for one.
         pausing = self._training is not None and self._training.alive
-        remote = self._ray.remote(num_cpus=0 if pausing else 1)(SimulationWorker)
         size = min(self.workers if pausing else self._wanted_workers, len(items))
-        pool = self._pool(lambda: remote.remote(self._suite), size, listener=self._counter, min_size=self.workers)
+
+        def start(cpus: int) -> Any:
+            return self._ray.remote(num_cpus=cpus)(SimulationWorker).remote(self._suite)
+
+        pool = self._pool(
+            lambda: start(0 if pausing else 1),
+            size,
+            listener=self._counter,
+            min_size=self.workers,
+            start_backup=lambda: start(0),
+        )
         try:
             with _naming_deadly_items():
-                yield from pool.results(_submit(pool, items))
+                yield from results_tried_again(pool, _submit(pool, items), set())
         finally:
             pool.close()
 
@@ -143,21 +157,81 @@ class RaySimulation(Generic[T]):
     def __init__(self, pool: "Pool", items: Sequence[WorkItem[T]]) -> None:
         """Submit the items."""
         self._pool, self._calls = pool, _submit(pool, items)
+        self._suspects = set[int]()
 
     def done(self) -> bool:
         """Return, without waiting, whether all results are there."""
         with _naming_deadly_items():
-            self._pool.poll()
+            try:
+                self._pool.poll()
+            except DeadlyCallError as error:
+                try_again(self._pool, error, self._suspects)
         return all(call.done for call in self._calls)
 
     def results(self) -> list[T]:
         """Wait for all results and return them in the order of the items."""
         with _naming_deadly_items():
-            return [self._pool.result(call) for call in self._calls]
+            found = dict(results_tried_again(self._pool, self._calls, self._suspects))
+        return [found[index] for index in range(len(self._calls))]
+
+
+def put_suite(suite: TaskSuite, put: Callable[[object], T]) -> T:
+    """Return what `put`, as Ray's, makes of a suite that travels to workers.
+
+    Raises:
+        UserError: names the members that cannot, in place of Ray's own parts.
+    """
+
+    def refusal(value: object) -> str:
+        try:
+            put(value)
+        except Exception as error:  # noqa: BLE001  an object may raise anything when it is pickled
+            return error_line(error)
+        return ""
+
+    try:
+        return put(suite)
+    except Exception as error:
+        members = {name: why for name, value in vars(suite).items() if (why := refusal(value))}
+        raise UserError(
+            f"{suite.name}: {', '.join(members) or 'the suite'}: got what cannot be pickled "
+            f"({next(iter(members.values()), error_line(error))}); wanted a suite that travels to workers, see "
+            "docs/your-own-task.md: make it in make_env, or give --runner local"
+        ) from error
 
 
 def _submit(pool: "Pool", items: Sequence[WorkItem[Any]]) -> list[Call]:
     return [pool.submit("run", item, label=item.label) for item in items]
+
+
+def results_tried_again(pool: "Pool", calls: Sequence[Call], suspects: set[int]) -> Iterator[tuple[int, Any]]:
+    """Yield each call's index and result as they arrive; one that seems to kill its workers is tried once more.
+
+    Raises:
+        DeadlyCallError: as `try_again`.
+    """
+    left = dict(enumerate(calls))
+    while left:
+        indices = list(left)
+        try:
+            for position, value in pool.results(list(left.values())):
+                del left[indices[position]]
+                yield indices[position], value
+        except DeadlyCallError as error:
+            try_again(pool, error, suspects)
+
+
+def try_again(pool: "Pool", error: DeadlyCallError, suspects: set[int]) -> None:
+    """Try a call once more during which workers ended: who ended them for another reason hardly ends so many again.
+
+    Raises:
+        DeadlyCallError: if it was tried again already, and so is among the suspects.
+    """
+    if error.call.number in suspects:
+        raise error
+    suspects.add(error.call.number)
+    logger.warning(f"{error}; it is tried once more")
+    pool.retry(error.call)
 
 
 @contextmanager

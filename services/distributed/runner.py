@@ -1,10 +1,7 @@
 """Runners of an experiment's work, and the one in this process; that of `ray_runner` gives the same bits."""
 
 import math
-import signal
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import torch
@@ -14,6 +11,7 @@ from dmil_core.demonstrations import Demonstration
 from dmil_core.methods.base import MetaLearner
 from dmil_core.outer_loop import NonfiniteSlot, OuterState, groups, tasks_of
 from services.cli.live_view import Workers
+from services.cli.stopping import stops_deferred
 from services.distributed.adaptation_worker import AdaptationWorker, Block
 from services.distributed.learner import Learner
 from services.distributed.metrics import Meter
@@ -189,7 +187,7 @@ class LocalMetaTraining:
         for _ in range(count):
             block = Block(self._next, self._plan.tasks(self._next), groups(self._plan.settings))
             report, gradient = self._worker.gradient(self._parameters, block)
-            with _signals_deferred():
+            with stops_deferred():  # a step of Adam that is interrupted leaves no state to continue from
                 stepped, self._parameters = self._learner.step(gradient)
             timing = Timing.of(self._ready, {0: [report.span]}, stepped.span)
             self._next, self._ready = self._next + 1, stepped.span.ended
@@ -201,23 +199,3 @@ class LocalMetaTraining:
 
     def close(self) -> None:
         """Nothing to stop."""
-
-
-@contextmanager
-def _signals_deferred() -> Iterator[None]:
-    """Defer Ctrl-C and SIGTERM: a step of Adam that is interrupted leaves no state to continue from."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    deferred: list[int] = []
-    handlers = {
-        number: signal.signal(number, lambda number, frame: deferred.append(number))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        for number in deferred:
-            signal.raise_signal(number)

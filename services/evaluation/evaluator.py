@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from dmil_core.checkpoint import Checkpoint
+from dmil_core.checkpoint import Checkpoint, CheckpointError, iteration_of
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.files import inside
@@ -20,9 +20,9 @@ from services.distributed.metrics import EPISODES, SUCCESS_RATE, SUCCESSES, Mete
 from services.distributed.runner import Runner, Simulation
 from services.distributed.work_items import AdaptationItem, AdaptationRollouts
 from services.evaluation.results import AdaptationResult, EpisodeResult, ImitationResult, write_rows
-from services.evaluation.summary import Evaluation, rates, sub_skill_shares, summary_rows
+from services.evaluation.summary import Evaluation, faults_of, rates, sub_skill_shares, summary_rows
 from services.rollouts.adaptations import Adaptation, AdaptationOutcome, ImitationErrors, plan_adaptations
-from services.storage.checkpoints import Checkpoints, iteration_of
+from services.storage.checkpoints import Checkpoints
 from services.storage.provenance import library_versions
 from services.suites.base import Split, TaskSuite
 from services.tracking.tracker import Tracker
@@ -46,8 +46,11 @@ class Tallies:
         return iter(sorted(tallies, key=lambda tally: (tally.split == "meta-testing", tally.shots)))
 
     def add(self, adaptation: Adaptation, outcome: AdaptationOutcome) -> None:
-        """Count an adaptation's episodes."""
-        successes, episodes = sum(episode.success for episode in outcome.episodes), len(outcome.episodes)
+        """Count an adaptation's episodes, without those that the simulator spoiled."""
+        sound = [episode for episode in outcome.episodes if episode.fault is None]
+        if not sound:
+            return
+        successes, episodes = sum(episode.success for episode in sound), len(sound)
         before = self._counts.get((adaptation.split, adaptation.shots), (0, 0))
         self._counts[adaptation.split, adaptation.shots] = before[0] + successes, before[1] + episodes
         self._meter.record(EPISODES, float(episodes), split=adaptation.split, shots=str(adaptation.shots))
@@ -168,6 +171,7 @@ class Evaluations:
         """
         self._runner, self._evaluator, self._checkpoints, self._tracker = runner, evaluator, checkpoints, tracker
         self._run = checkpoints.folder.parent
+        self._damaged: set[Path] = set()
         self._overlap = overlap
         self._under_way: tuple[Checkpoint, Simulation[AdaptationOutcome]] | None = None
         self.latest: dict[str, Any] = {}
@@ -179,16 +183,24 @@ class Evaluations:
 
     def pending(self) -> list[Path]:
         """Return the checkpoints whose evaluation is due and not complete, oldest first."""
-        due = [path for path in self._checkpoints.all() if self.is_due(iteration_of(path))]
+        due = [
+            path for path in self._checkpoints.all() if self.is_due(iteration_of(path)) and path not in self._damaged
+        ]
         return [path for path in due if not (self._folder_of(iteration_of(path)) / "episodes.jsonl").exists()]
 
     def _folder_of(self, iteration: int) -> Path:
         return inside(self._run, f"evaluations/{iteration:07d}")
 
     def catch_up(self) -> None:
-        """Evaluate the checkpoints whose evaluation was dropped when the run was stopped."""
+        """Evaluate the checkpoints whose evaluation was dropped when the run was stopped, but no damaged ones."""
         for path in self.pending():
-            self.begin(Checkpoint(path))
+            try:
+                checkpoint = Checkpoint(path)
+            except CheckpointError as error:
+                logger.warning(f"{error}; it is not evaluated")
+                self._damaged.add(path)
+            else:
+                self.begin(checkpoint)
 
     def begin(self, checkpoint: Checkpoint) -> None:
         """Evaluate a checkpoint."""
@@ -230,6 +242,8 @@ class Evaluations:
         self._tracker.metrics(iteration, rates(rows, sub_skill_shares(evaluation.adaptations)))
         success_rates = "; ".join(f"{cell.split} {cell.shots}-shot {cell.success_rate:.3f}" for cell in rows)
         logger.info(f"success rates after {iteration} iterations: {success_rates}")
+        if faults := faults_of(evaluation.episodes):
+            logger.warning(f"after {iteration} iterations: {faults}")
 
 
 def write_evaluation(evaluation: Evaluation, folder: Path) -> None:

@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dmil_core.errors import UserError, describe_errors
 from dmil_core.files import read_file, write_file
@@ -58,6 +58,13 @@ class EpisodeResult(_Row):
     steps: int
     sub_skill_steps: tuple[int, ...]
     """How many steps each sub-skill acted."""
+    fault: int | None = Field(default=None, exclude_if=lambda fault: fault is None)
+    """The first observation that is not finite: the simulator's fault, for which the episode does not count."""
+
+    @property
+    def label(self) -> str:
+        """Its name in messages."""
+        return f"{self.split} task {self.task}, {self.shots}-shot, episode {self.episode}, seed {self.seed}"
 
 
 class AdaptationResult(_Row):

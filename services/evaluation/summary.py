@@ -110,6 +110,8 @@ class Summary(BaseModel):
     """Of each task, those held out among them; older files have none."""
     controls: list[ControlRow] = []
     """Beside the run on meta-testing tasks, where the settings ask for any."""
+    faults: str = ""
+    """In words, the episodes that do not count because the simulator gave numbers that are not finite."""
 
     @property
     def collapsed(self) -> bool:
@@ -117,14 +119,27 @@ class Summary(BaseModel):
         return any(len(use.share) > 1 and max(use.share) > COLLAPSED for use in self.sub_skills.values())
 
 
+def faults_of(episodes: Sequence[EpisodeResult]) -> str:
+    """Return in words how many episodes the simulator spoiled, and the first of them; nothing where there are none."""
+    faulty = [row for row in episodes if row.fault is not None]
+    if not faulty:
+        return ""
+    first = faulty[0]
+    return (
+        f"{len(faulty)} of {len(episodes)} episodes do not count: the simulator gave an observation that is not "
+        f"finite, first in {first.label}, after step {first.fault}"
+    )
+
+
 def summary_rows(episodes: Sequence[EpisodeResult], best_score: int, method: MethodConfig) -> list[SummaryRow]:
-    """Return one cell for each split and size of support set, with Wilson intervals.
+    """Return one cell for each split and size of support set, with Wilson intervals, without `faults_of`.
 
     Where the score of an episode in which all is done is more than 1, scores are given too.
     """
     key = attrgetter("suite", "split", "shots")
     rows = []
-    for (suite, split, shots), group in groupby(sorted(episodes, key=key), key=key):
+    sound = [row for row in episodes if row.fault is None]
+    for (suite, split, shots), group in groupby(sorted(sound, key=key), key=key):
         of_group = list(group)
         rate = success_rate([row.success for row in of_group])
         tasks = dict.fromkeys(row.task for row in of_group)
@@ -221,6 +236,7 @@ def summarise(
         failed_attempts=evaluation.failed_attempts,
         demonstrations=evaluation.demonstrations,
         controls=list(controls),
+        faults=faults_of(evaluation.episodes),
     )
 
 
@@ -258,7 +274,8 @@ def table_markdown(summary: Summary) -> str:
     if summary.controls:
         rows = (row.fields for row in summary.controls)
         lines += ["", *markdown_rows(HEAD, rows), "", *(f"{sentence}." for sentence in said(summary.controls))]
-    return f"Success rates of {for_markdown(described(summary))}.\n\n" + "\n".join(lines) + "\n"
+    faults = f"{for_markdown(summary.faults)}.\n\n" if summary.faults else ""
+    return f"Success rates of {for_markdown(described(summary))}.\n\n{faults}" + "\n".join(lines) + "\n"
 
 
 def described(summary: Summary) -> str:

@@ -1,15 +1,15 @@
 """One experiment, put together from its config once, for all programs: collect, meta-train, evaluate."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from dmil_core.checkpoint import Checkpoint, CheckpointError, Manifest, Range
+from dmil_core.checkpoint import MANIFEST, Checkpoint, CheckpointError, Manifest, Range
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import Demonstration
-from dmil_core.errors import UserError
+from dmil_core.errors import RunError, UserError, shorten
 from dmil_core.methods.base import MetaLearner, Method, OnlineMetaLearner
 from dmil_core.methods.registry import method_type
 from dmil_core.networks import Parameters, flatten
@@ -25,7 +25,7 @@ from services.distributed.work_items import AdaptationRollouts
 from services.evaluation.controls import ControlRow, control_items, control_rows
 from services.evaluation.evaluator import Evaluations, Evaluator, Tallies, write_evaluation
 from services.evaluation.results import write_rows
-from services.evaluation.summary import Evaluation
+from services.evaluation.summary import Evaluation, faults_of
 from services.experiments.meta_training import CheckpointWriter, IterationLog, meta_train
 from services.rollouts.adaptations import AdaptationOutcome
 from services.storage.checkpoints import Checkpoints
@@ -35,6 +35,10 @@ from services.suites.registry import open_suite
 from services.tracking.tracker import Tracker
 
 OnNonfinite = Literal["stop", "skip"]
+MOST_FAULTS = 0.01
+"""Of the episodes of an evaluation, those that a simulator may spoil."""
+CHANGEABLE = {"evaluation": True, "training": {"iterations", "checkpoint_every", "checkpoints_kept"}}
+"""Settings that a run may change when it goes on, without becoming another."""
 
 
 class Experiment:
@@ -115,8 +119,8 @@ class Experiment:
     ) -> Checkpoint:
         """Meta-train to the set number of iterations and return the last checkpoint.
 
-        Stopped by Ctrl-C, SIGTERM or a fault, it writes a checkpoint first, and drops an evaluation that is under way,
-        which a resumed run catches up on.
+        Whatever ends it, it writes a checkpoint first, and drops an evaluation that is under way, which a resumed run
+        catches up on.
 
         Args:
             runner: does the work.
@@ -141,10 +145,11 @@ class Experiment:
             initial = self.initial_parameters(method)
             state, manifest = OuterState.start(flatten(initial).numpy()), self._manifest(initial, data, sets)
         else:
-            _same_data(resume, data, self.store)
+            check_data(resume, data, self.store)
             changed = {"config": self.config, "versions": library_versions(), **self._ranges(sets)}
             state, manifest = resume.state, resume.manifest.model_copy(update=changed)
-        writer = CheckpointWriter(checkpoints, manifest, method.constants(), runner, tracker, evaluations.pending)
+        path = resume and resume.path
+        writer = CheckpointWriter(checkpoints, manifest, method.constants(), runner, tracker, evaluations.pending, path)
         evaluations.catch_up()
         if state.iteration >= self.config.training.iterations:
             evaluations.finish()
@@ -194,6 +199,9 @@ class Experiment:
         """Adapt a checkpoint to every task of both splits, and return a row for each episode and adaptation.
 
         They are also written to ``episodes.jsonl`` and ``adaptations.jsonl`` in `folder`; `only` restricts the tasks.
+
+        Raises:
+            RunError: if the simulator spoiled more than `MOST_FAULTS` of the episodes.
         """
         evaluator = self.evaluator(runner, data, only)
         outcomes: dict[int, AdaptationOutcome] = {}
@@ -215,6 +223,9 @@ class Experiment:
         tallies.finish()
         evaluation = evaluator.evaluation(checkpoint, [outcomes[index] for index in range(len(evaluator.adaptations))])
         write_evaluation(evaluation, folder)
+        faulty = sum(row.fault is not None for row in evaluation.episodes)
+        if faulty > MOST_FAULTS * len(evaluation.episodes):
+            raise RunError(f"{faults_of(evaluation.episodes)}; wanted at most {MOST_FAULTS:.0%}; mend the environment")
         return evaluation
 
     def evaluate_controls(
@@ -261,11 +272,50 @@ class Experiment:
         return Evaluator(runner, self.config, self.suite, tasks, data, self.held_out_sets(data))
 
 
+def check_settings(resume: Checkpoint, config: ExperimentConfig, origin: Path) -> None:
+    """Refuse to go on from a checkpoint with other settings than it was trained with.
+
+    Args:
+        resume: the checkpoint.
+        config: all settings that are meant.
+        origin: the file that has them.
+
+    Raises:
+        UserError: names file and keys, or the number of iterations where that was passed already.
+    """
+    before, now = resume.manifest.config, config
+    if changed := changed_settings(before, now):
+        raise UserError(
+            f"{origin}: got other settings than {resume.path / MANIFEST}, which was trained with "
+            f"{', '.join(f'{key} {shorten(old)}, not {shorten(new)}' for key, (old, new) in changed.items())}; wanted "
+            "one run's: restore the file, or remove the checkpoint if it is another run's"
+        )
+    if resume.manifest.iteration > config.training.iterations:
+        raise UserError(
+            f"--training.iterations: got {config.training.iterations}; wanted at least the {resume.manifest.iteration} "
+            f"that are done: {resume.path}"
+        )
+
+
+def changed_settings(before: ExperimentConfig, now: ExperimentConfig) -> dict[str, tuple[Any, Any]]:
+    """Return the settings that differ and make another run, by dotted key: the one before, and the one now."""
+    old, new = (dict(_flat(config.model_dump(exclude=CHANGEABLE), "")) for config in (before, now))
+    return {key: (old.get(key), new.get(key)) for key in old | new if old.get(key) != new.get(key)}
+
+
+def _flat(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
 def _digests(data: Mapping[str, TaskDemonstrations]) -> dict[str, str]:
     return {task: dataset.digest for task, dataset in data.items()}
 
 
-def _same_data(resume: Checkpoint, data: Mapping[str, TaskDemonstrations], store: DemoStore) -> None:
+def check_data(resume: Checkpoint, data: Mapping[str, TaskDemonstrations], store: DemoStore) -> None:
     """Refuse to go on with other demonstrations.
 
     Raises:

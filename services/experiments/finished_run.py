@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 from dmil_core.checkpoint import Checkpoint
 from dmil_core.configs import ExperimentConfig
@@ -10,13 +11,14 @@ from dmil_core.errors import UserError
 from dmil_core.files import inside, read_json
 from services.demonstrations.store import TaskDemonstrations, open_store
 from services.distributed.runner import LocalRunner
-from services.evaluation.results import EpisodeResult, EvaluationFolder, read_rows
+from services.evaluation.results import AdaptationResult, EpisodeResult, EvaluationFolder, read_rows
 from services.evaluation.summary import Summary
 from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoints
-from services.storage.run_folders import find_folder
+from services.storage.run_folders import find_folder, resume_command
 from services.tracking.history import Origin, read_metrics, read_origin
 
+Result = TypeVar("Result", EpisodeResult, AdaptationResult)
 MARK, BEGUN, CHECKPOINTS = "summary.json", "config.json", "checkpoints"
 """What the folder of a finished run is known by, what that of any run, and what no evaluation's has."""
 MOST_BYTES = 2**24
@@ -41,7 +43,7 @@ class FinishedRun(EvaluationFolder):
                 if (begun / BEGUN).is_file():
                     raise UserError(
                         f"RUN: got {begun}, which has not come to its end; wanted a finished run, with a {MARK}; go on "
-                        f"with it: dmil meta-train --resume {begun}"
+                        f"with it: {resume_command(begun)}"
                     ) from error
             raise
         if not (folder / CHECKPOINTS).is_dir():
@@ -63,8 +65,31 @@ class FinishedRun(EvaluationFolder):
         Raises:
             UserError: if the file is not as a run writes it.
         """
-        advice = f"write it again: dmil meta-train --resume {self.folder}"
+        advice = f"write it again: {resume_command(self.folder)}"
         return read_json(self.folder, MARK, Summary, MOST_BYTES, f"wanted what a run writes at its end; {advice}")
+
+    @cached_property
+    def episodes(self) -> list[EpisodeResult]:
+        """A row an episode of the evaluation at the end.
+
+        Raises:
+            UserError: if they are another checkpoint's than the summary.
+        """
+        return self._of_the_summary(super().episodes, "episodes.jsonl")
+
+    @cached_property
+    def adaptations(self) -> list[AdaptationResult]:
+        """A row an adaptation, as `episodes`."""
+        return self._of_the_summary(super().adaptations, "adaptations.jsonl")
+
+    def _of_the_summary(self, rows: list[Result], name: str) -> list[Result]:
+        wanted = self.summary.checkpoint_digest
+        if strange := sorted({row.checkpoint for row in rows} - {wanted}):
+            raise UserError(
+                f"{self.folder / name}: checkpoint: got rows of {strange[0][:12]}; wanted those of {wanted[:12]}, as "
+                f"checkpoint_digest in {MARK} says; restore both, or write them again: {resume_command(self.folder)}"
+            )
+        return rows
 
     @cached_property
     def checkpoint(self) -> Checkpoint:
@@ -95,8 +120,10 @@ class FinishedRun(EvaluationFolder):
         """The rows of each evaluation by its iteration: those on the way, and the one of the last checkpoint."""
         on_the_way = {
             int(path.parent.name): read_rows(inside(self.folder, path.relative_to(self.folder)), EpisodeResult)
-            for path in sorted(self.folder.glob("evaluations/*/episodes.jsonl"))
-            if path.parent.name.isdecimal()
+            for path in sorted(
+                (path for path in self.folder.glob("evaluations/*/episodes.jsonl") if path.parent.name.isdecimal()),
+                key=lambda path: int(path.parent.name),
+            )
         }
         return on_the_way if self.has_gone_on else on_the_way | {self.checkpoint.manifest.iteration: self.episodes}
 

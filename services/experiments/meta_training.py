@@ -13,7 +13,7 @@ from dmil_core.checkpoint import Checkpoint, Manifest
 from dmil_core.errors import RunError
 from dmil_core.outer_loop import OuterState
 from services.cli.live_view import Status
-from services.cli.progress import Bar
+from services.cli.progress import Bar, aside
 from services.distributed.failures import keeping_failures
 from services.distributed.metrics import CHECKPOINT_TIME, SPOOL_RECORDS
 from services.distributed.runner import Plan, Runner
@@ -21,6 +21,7 @@ from services.evaluation.evaluator import Evaluations
 from services.evaluation.summary import AGAINST_COLLAPSE, COLLAPSED
 from services.experiments.iteration_metrics import iteration_metrics, nonfinite_message, shares_of, status_of
 from services.storage.checkpoints import Checkpoints
+from services.storage.run_folders import resume_command
 from services.tracking.tracker import Tracker
 
 logger = logging.getLogger(__name__)
@@ -44,8 +45,19 @@ class CheckpointWriter:
         runner: Runner,
         tracker: Tracker,
         needed: Callable[[], Collection[Path]],
+        path: Path | None = None,
     ) -> None:
-        """Write nothing yet; `needed` returns the older checkpoints that must not be removed yet."""
+        """Write nothing yet.
+
+        Args:
+            checkpoints: of the run.
+            manifest: of the state that is gone on from.
+            constants: what the method learned once.
+            runner: whose meter records the time of each checkpoint.
+            tracker: knows the MLflow run's id.
+            needed: returns the older checkpoints that must not be removed yet.
+            path: the checkpoint that is gone on from, which is not written again.
+        """
         self.folder = checkpoints.folder.parent
         """Of the run."""
         self.manifest = manifest
@@ -54,7 +66,7 @@ class CheckpointWriter:
         self._meter, self._tracker = runner.meter, tracker
         self._losses: list[float] = []
         self._environment_steps = manifest.environment_steps
-        self._path: Path | None = None
+        self._path = path
 
     def add(self, metrics: Mapping[str, float], *, stepped: bool) -> None:
         """Count an iteration; the loss of one without an outer step is left out."""
@@ -132,7 +144,7 @@ def meta_train(
 ) -> Path:
     """Meta-train from the plan's state to its last iteration, and return the last checkpoint's folder.
 
-    Ended by Ctrl-C, SIGTERM or a fault, it writes a checkpoint first.
+    Whatever ends it, a checkpoint of the last whole iteration is written first, if its disk takes it.
 
     Raises:
         RunError: where numbers are not finite, or for an error in a slot, which is named.
@@ -167,13 +179,14 @@ def meta_train(
                             evaluations.begin(Checkpoint(path))
                 evaluations.finish()
             return write()
-        except KeyboardInterrupt:
-            write()
+        except BaseException:
+            with aside("the checkpoint of the last iteration"):
+                write()
             raise
 
 
 def _nonfinite_error(problem: str, folder: Path) -> RunError:
     return RunError(
         f"{problem}; the step is not taken, the state before it is checkpointed; look at these demonstrations, or go "
-        f"on without such steps: python -m services.meta_train --resume {folder} --on-nonfinite skip"
+        f"on without such steps: {resume_command(folder)} --on-nonfinite skip"
     )

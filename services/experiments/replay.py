@@ -16,6 +16,7 @@ from services.evaluation.results import EpisodeResult
 from services.experiments.finished_run import FinishedRun
 from services.rollouts.adaptations import EpisodeOutcome
 from services.rollouts.recording import Recording, VideoSettings, record_expert, record_rollouts
+from services.storage.run_folders import resume_command
 from services.suites.base import Environment, build_env
 
 
@@ -107,7 +108,7 @@ class Replay:
         if checkpoint.digest != row.checkpoint:
             raise ReplayError(
                 f"{checkpoint.path}: got the digest {checkpoint.digest[:12]}; the episodes are of "
-                f"{row.checkpoint[:12]}; evaluate the run's end: dmil meta-train --resume {run.folder}"
+                f"{row.checkpoint[:12]}; evaluate the run's end: {resume_command(run.folder)}"
             )
         method = checkpoint.method(run.experiment.suite.action_dim)
         fine_tuning = FineTuning(row.fine_tuning_steps, row.learning_rate, row.optimiser, row.displaced)

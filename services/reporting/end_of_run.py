@@ -32,6 +32,8 @@ def publish(tracker: Tracker, summary: Summary, folder: Path) -> None:
     """Record the success rates, of each task and in all, the report and the episodes on the MLflow run."""
     metrics = rates(summary.rows, summary.sub_skills)
     metrics |= {f"seconds/{phase}": spent for phase, spent in summary.seconds.items()}
+    if summary.faults:
+        tracker.tags({"simulator_faults": summary.faults})
     tracker.metrics(Checkpoint(Path(summary.checkpoint)).manifest.iteration, metrics, anew=True)
     tracker.tags({"mlflow.note.content": table_markdown(summary)})
     for path, destination in (
@@ -59,6 +61,8 @@ def show(summary: Summary, addresses: Sequence[str] = ()) -> None:
         console.print(
             f"warning: one sub-skill takes nearly all states, so the hierarchy is not used; {AGAINST_COLLAPSE}"
         )
+    if summary.faults:
+        console.print(f"warning: {summary.faults}")
     if failed := {task: count for task, count in summary.failed_attempts.items() if count}:
         console.print("failed expert attempts: " + ", ".join(f"{task} {count}" for task, count in failed.items()))
     console.print("seconds: " + ", ".join(f"{phase} {spent:.0f}" for phase, spent in summary.seconds.items()))

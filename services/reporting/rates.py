@@ -20,7 +20,7 @@ INCHES_A_TASK = 0.22
 def estimates(episodes: Sequence[EpisodeResult], *, scores: bool) -> dict[tuple[Split, int, str], Mean]:
     """Return the success rate, with Wilson's interval, by split, shots and task; of scores the mean with Student's."""
     groups: dict[tuple[Split, int, str], list[EpisodeResult]] = defaultdict(list)
-    for row in episodes:
+    for row in (row for row in episodes if row.fault is None):
         groups[row.split, row.shots, row.task].append(row)
     if scores:
         return {key: mean_score([float(row.score) for row in rows]) for key, rows in groups.items()}
@@ -37,6 +37,8 @@ def table_of_all(finished: FinishedRun) -> list[Part]:
     summary = finished.summary
     head, *rows = headline(summary)
     parts: list[Part] = [Prose(f"Success rates of {described(summary)}.")]
+    if summary.faults:
+        parts.append(Prose(f"Warning: {summary.faults}."))
     if summary.collapsed:
         parts.append(
             Prose(

@@ -80,12 +80,14 @@ class EpisodeOutcome(NamedTuple):
     steps: int
     sub_skill_steps: list[int]
     """Steps in which each sub-skill acted, up to the highest one that did."""
+    fault: int | None = None
+    """The first observation that the simulator gave and that is not finite, the reset's being 0."""
 
     @classmethod
     def of(cls, rollout: Rollout) -> "EpisodeOutcome":
         """Leave out the trajectory."""
         counts = np.bincount(rollout.sub_skills).tolist()
-        return cls(rollout.seed, rollout.goal, rollout.success, rollout.score, len(rollout), counts)
+        return cls(rollout.seed, rollout.goal, rollout.success, rollout.score, len(rollout), counts, rollout.fault)
 
 
 class AdaptationOutcome(NamedTuple):

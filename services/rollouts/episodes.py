@@ -39,7 +39,7 @@ class _Recorder:
             raise UserError("info of a step: got no success; wanted whether the task is solved; have step() say so")
         if self.info["success"] and self.solved_at is None:
             self.solved_at = len(self.actions)
-        self._score = max(self._score, int(self.info.get("score", self.info["success"])))
+        self._score = max(self._score, int(np.asarray(self.info.get("score", self.info["success"])).item()))
         self.observations.append(self.observation.astype(np.float32))
         self.actions.append(recorded.copy())
 

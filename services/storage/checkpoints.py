@@ -21,20 +21,17 @@ from dmil_core.checkpoint import (
     Manifest,
     checkpoints_in,
     inside_run,
+    iteration_of,
     newest,
+    newest_whole,
     read_manifest,
 )
 from dmil_core.checksums import listing, sha256
-from dmil_core.files import create_file, making_folder, remove_abandoned, remove_folder, room_for
+from dmil_core.files import check_folder, create_file, making_folder, remove_abandoned, remove_folder, room_for
 from dmil_core.networks import unflatten
 from dmil_core.outer_loop import OuterState
 
 logger = logging.getLogger(__name__)
-
-
-def iteration_of(path: Path) -> int:
-    """Return the iteration that the folder of a checkpoint is named by."""
-    return int(path.name.partition("-")[2])
 
 
 class Checkpoints:
@@ -57,6 +54,10 @@ class Checkpoints:
         """
         return newest(self.folder, logger.warning)
 
+    def newest_whole(self) -> Checkpoint | None:
+        """Read the newest checkpoint that is whole, if there is one."""
+        return newest_whole(self.folder)[0]
+
     def save(
         self,
         state: OuterState,
@@ -68,7 +69,9 @@ class Checkpoints:
 
         Raises:
             DiskFullError: for want of space; what was written by then is removed.
+            RunError: if the run's folder is gone.
         """
+        check_folder(self.folder.parent)
         path = self.folder / f"iteration-{state.iteration:07d}"
         parameters = unflatten(torch.tensor(state.parameters), manifest.torch_shapes)
         contents: dict[str, Mapping[str, np.ndarray]] = {
@@ -110,5 +113,6 @@ class Checkpoints:
         scored = {path: loss for path, loss in losses.items() if loss is not None and math.isfinite(loss)}
         whole, best = list(losses), min(scored, key=lambda path: scored[path], default=None)
         for path in self.all() if len(whole) > self.kept else []:
-            if path < whole[-self.kept] and path != best and path not in needed and not path.is_symlink():
+            is_older = iteration_of(path) < iteration_of(whole[-self.kept])
+            if is_older and path != best and path not in needed and not path.is_symlink():
                 remove_folder(self.folder.parent, f"{self.folder.name}/{path.name}")

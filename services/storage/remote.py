@@ -6,7 +6,7 @@ written last and removed first. So a writer that is killed between two files lea
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -37,7 +37,7 @@ class Storage:
         except ImportError as error:
             package = PACKAGES.get(url.partition(":")[0], "the package that it names")
             raise UserError(f"{STORAGE}: got {self.url}, which needs {package}: pip install {package}") from error
-        except ValueError as error:
+        except (ValueError, OSError) as error:  # OSError: a kind that connects at once
             raise UserError(f"{STORAGE}: got {self.url} ({redacted(str(error))}); wanted a URL as {KINDS}") from error
         self._root = root.rstrip("/")
 
@@ -86,8 +86,18 @@ class Storage:
         for file in sorted(contents, key=lambda file: file == marker):
             self.put(f"{name}/{file}", contents[file])
 
-    def get_folder(self, name: str, root: Path, target: str, files: Mapping[str, int], marker: str) -> bool:
-        """Fetch a folder whose marker is there, and return whether it was; who reads it checks it.
+    def get_folder(
+        self,
+        name: str,
+        root: Path,
+        target: str,
+        files: Mapping[str, int],
+        marker: str,
+        check: Callable[[Path], object] = lambda made: None,
+        *,
+        instead: bool = False,
+    ) -> bool:
+        """Fetch a folder whose marker is there, and return whether it was.
 
         Args:
             name: of the folder here.
@@ -95,6 +105,8 @@ class Storage:
             target: its name there; it is made by a rename, unless it is there by then.
             files: what is in it besides the marker, and how many bytes each may have at most.
             marker: the name of the file that vouches for them.
+            check: looks at what was fetched before it has its name; what it raises passes through, and nothing is kept.
+            instead: put it in the place of what has the name.
 
         Raises:
             RunError: for a file that is too large, or missing although the marker is there.
@@ -102,13 +114,14 @@ class Storage:
         content = self.get(f"{name}/{marker}", 2**20)
         if content is None:
             return False
-        with suppress(FileExistsError), making_folder(root, target) as made:
+        with suppress(FileExistsError), making_folder(root, target, instead=instead) as made:
             for file, most in files.items():
                 part = self.get(f"{name}/{file}", most)
                 if part is None:
                     raise RunError(f"{self.url}/{name}/{file}: got nothing; wanted what its {marker} vouches for")
                 create_file(made, file, part)
             create_file(made, marker, content)
+            check(made)
         return True
 
     def committed(self, name: str, marker: str, pattern: str) -> dict[str, bytes]:

@@ -3,13 +3,14 @@
 import logging
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 from uuid import uuid4
 
-from dmil_core.checkpoint import FILES, MARKER, MOST_MARKER, NAMED
-from dmil_core.errors import UserError
+from dmil_core.checkpoint import FILES, MARKER, MOST_MARKER, NAMED, Checkpoint, CheckpointError, iteration_of
+from dmil_core.errors import RunError, UserError
 from dmil_core.files import read_file, remove_folder, write_file
 from services.storage.checkpoints import Checkpoints
 from services.storage.folder_lock import held
@@ -17,6 +18,7 @@ from services.storage.redaction import error_line
 from services.storage.remote import Storage, given_storage
 
 logger = logging.getLogger(__name__)
+T = TypeVar("T")
 
 IDENTITY, SETTINGS = "mlflow_run.json", "config.json"
 RECORDS = (
@@ -103,7 +105,7 @@ class Replica:
     def _copy_checkpoints(self) -> None:
         place = f"{self._name}/checkpoints"
         there = self._storage.committed(place, MARKER, NAMED)
-        here = self._here()
+        here = [path.name for path in self._checkpoints.all()]
         for name in here:
             own = f"checkpoints/{name}"
             try:
@@ -122,22 +124,29 @@ class Replica:
 
     def is_ahead(self) -> bool:
         """Tell whether the storage has this run, and further than the folder, or the folder has none of it."""
-        tag, newest = self._tag(), self._newest()
+        tag = self._tag()
         if tag is not None and tag != self._get(CLAIM, MOST_CLAIM):
             return False
-        begun = (self._folder / SETTINGS).exists()
-        return newest > max(self._here(), default="") if begun else self._get(SETTINGS) is not None
+        return bool(self._newer()) if (self._folder / SETTINGS).exists() else self._get(SETTINGS) is not None
 
-    def _newest(self) -> str:
-        return max(self._storage.committed(f"{self._name}/checkpoints", MARKER, NAMED), default="")
+    def _newer(self) -> list[str]:
+        """Return the stored checkpoints that are newer than all whole ones in the folder, the newest first."""
+        whole = self._checkpoints.newest_whole()
+        here = -1 if whole is None else whole.manifest.iteration
+        there = self._storage.committed(f"{self._name}/checkpoints", MARKER, NAMED)
+        return sorted(
+            (name for name in there if iteration_of(Path(name)) > here), key=lambda name: -iteration_of(Path(name))
+        )
 
-    def _here(self) -> list[str]:
-        return [path.name for path in Checkpoints(self._folder / "checkpoints", kept=0).all()]
+    @property
+    def _checkpoints(self) -> Checkpoints:
+        return Checkpoints(self._folder / "checkpoints", kept=0)
 
     def restore(self) -> bool:
         """Fetch what the folder lacks; return whether there was anything.
 
-        Of checkpoints the newest is fetched, if it is newer than all in the folder; then the records too.
+        Of checkpoints the newest whole one is fetched, if it is newer than all whole ones in the folder; then the
+        records too.
 
         Raises:
             RunError: if the copy cannot be used.
@@ -145,13 +154,28 @@ class Replica:
         if not self.is_ahead():
             return False
         records = {name: self._get(name) for name in (CLAIM, *RECORDS)}
-        if newest := self._newest():
-            place = f"checkpoints/{newest}"
-            self._storage.get_folder(f"{self._name}/{place}", self._folder, place, FILES, MARKER)
+        newer = self._newer()
+        if newer and not any(map(self._fetched, newer)):
+            if self._checkpoints.newest_whole() is not None:
+                return False
+            raise RunError(
+                f"{self._storage.url}/{self._name}: got no whole checkpoint, see above; wanted one; try again"
+            )
         for name, content in records.items():
             if content is not None:
                 write_file(self._folder, name, content)
         return True
+
+    def _fetched(self, name: str) -> bool:
+        """Fetch a checkpoint in the place of a damaged one; return whether the storage had it whole."""
+        place = f"checkpoints/{name}"
+        try:
+            return self._storage.get_folder(
+                f"{self._name}/{place}", self._folder, place, FILES, MARKER, Checkpoint, instead=True
+            )
+        except (CheckpointError, RunError) as error:
+            logger.warning(f"{self._storage.url}/{self._name}/{place}: not taken: {error_line(error)}")
+            return False
 
 
 def _state(path: Path) -> tuple[float, int]:
@@ -171,37 +195,69 @@ def claim_name(folder: Path) -> None:
     storage = given_storage()
     if storage is None:
         return
-    replica, errors = Replica(folder, storage), list[Exception]()
+    replica = Replica(folder, storage)
     replica.new_tag()
+    try:
+        _answer(replica.claim)
+    except UserError:
+        remove_folder(folder.parent, folder.name)
+        raise
+    except Exception as error:  # noqa: BLE001  whatever a storage raises
+        why = error_line(error)
+        logger.warning(f"{storage.url} does not say whether the name {folder.name} is free there ({why}); going on")
 
-    def claim() -> None:
+
+def _answer(ask: Callable[[], T]) -> T:
+    """Return what a storage answers, or raise what it raises.
+
+    Raises:
+        TimeoutError: if it does not answer for `CLAIM_SECONDS`.
+    """
+    answers, errors = list[T](), list[Exception]()
+
+    def work() -> None:
         try:
-            replica.claim()
-        except Exception as error:  # noqa: BLE001  whatever a storage raises
+            answers.append(ask())
+        except Exception as error:  # noqa: BLE001  it is raised by the one who waits
             errors.append(error)
 
-    thread = threading.Thread(target=claim, name="claim", daemon=True)
+    thread = threading.Thread(target=work, name="storage", daemon=True)
     thread.start()
     thread.join(CLAIM_SECONDS)
-    if any(isinstance(error, UserError) for error in errors):
-        remove_folder(folder.parent, folder.name)
+    if errors:
         raise errors[0]
-    if errors or thread.is_alive():
-        logger.warning(f"{storage.url} does not say whether the name {folder.name} is free there; going on")
+    if not answers:
+        raise TimeoutError(f"no answer for {CLAIM_SECONDS:.0f} s")
+    return answers[0]
 
 
 def restored(folder: Path) -> bool:
     """Fetch a run that the storage has further than its folder; return whether it did.
 
+    A storage that does not answer stops no run that was begun here, or lies here whole: a warning is logged.
+
     Raises:
         UserError: if ``DMIL_STORAGE`` names none, or another process works in the folder.
-        RunError: if the copy cannot be used.
+        RunError: if the copy cannot be used, and the folder has nothing to go on from.
     """
     storage = given_storage()
-    if storage is None or not (replica := Replica(folder, storage)).is_ahead():
+    if storage is None:
         return False
-    with held(folder):
-        return replica.restore()
+    replica = Replica(folder, storage)
+    try:
+        if not _answer(replica.is_ahead):
+            return False
+        with held(folder):
+            return replica.restore()
+    except UserError:
+        raise
+    except Exception as error:  # noqa: BLE001  whatever a storage raises
+        if (folder / SETTINGS).is_file():
+            logger.warning(f"{storage.url} does not give {folder} ({error_line(error)}); going on with what is here")
+            return False
+        raise RunError(
+            f"{storage.url} does not give {folder}: {error_line(error)}; wanted the run; try again"
+        ) from None
 
 
 @contextmanager

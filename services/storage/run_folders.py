@@ -1,9 +1,17 @@
 """The folders of runs and sweeps: made under a name, and found by it or by their path."""
 
+import os
+import shlex
+import unicodedata
 from pathlib import Path
 
 from dmil_core.errors import UserError, shorten
-from dmil_core.files import ForeignFileError, inside
+from dmil_core.files import ForeignFileError, at_home, inside
+
+MOST_BYTES = 255 - len(".checkpoint")
+"""Of a name, as file systems have it; some room is left for names that are made of it."""
+FORMS = ("NFC", "NFD")
+"""How one text may be written in Unicode: its letters with their accents, or before them; both are one name."""
 
 
 def new_name(name: str, runs: Path) -> Path:
@@ -12,12 +20,16 @@ def new_name(name: str, runs: Path) -> Path:
     Raises:
         UserError: if the name is none, or taken.
     """
-    if name in (".", "..") or Path(name).name != name:
+    if not set(name) - {"."} or Path(name).name != name:
         raise UserError(f"--name: got {shorten(name)}; wanted the name of a folder in {runs}, without any /")
-    folder = _inside_runs(runs / name, runs, "--name")
-    if folder.exists():
-        raise _taken(folder)
-    return folder
+    size = len(os.fsencode(name))
+    if not name.isprintable() or size > MOST_BYTES:
+        got = f"{size} bytes" if name.isprintable() else shorten(name)
+        raise UserError(f"--name: got {got}; wanted at most {MOST_BYTES} bytes of characters that can be printed")
+    for form in FORMS:
+        if (folder := _inside_runs(runs / unicodedata.normalize(form, name), runs, "--name")).exists():
+            raise _taken(folder)
+    return runs / unicodedata.normalize("NFC", name)
 
 
 def make_folder(folder: Path) -> None:
@@ -33,7 +45,12 @@ def make_folder(folder: Path) -> None:
 
 
 def _taken(folder: Path) -> UserError:
-    return UserError(f"--name: got {folder}, which is taken; wanted a new name, or --resume {folder}")
+    return UserError(f"--name: got {folder}, which is taken; wanted a new name, or --resume {shlex.quote(str(folder))}")
+
+
+def resume_command(folder: Path, program: str = "meta-train") -> str:
+    """Return the line that goes on with a run or sweep, as it can be pasted into a shell."""
+    return f"dmil {program} --resume {shlex.quote(str(folder))}"
 
 
 def find_folder(name: str, runs: Path, mark: str, flag: str = "--resume") -> Path:
@@ -42,8 +59,13 @@ def find_folder(name: str, runs: Path, mark: str, flag: str = "--resume") -> Pat
     Raises:
         UserError: if there is none.
     """
-    for folder in (Path(name), runs / name):
-        if (folder / mark).is_file():
+    names = dict.fromkeys((name, *(unicodedata.normalize(form, name) for form in FORMS)))
+    for folder in (path for each in names for path in (at_home(each), runs / each)):
+        try:
+            found = (folder / mark).is_file()
+        except (OSError, ValueError):  # a name that no folder can have
+            continue
+        if found:
             return _inside_runs(folder, runs, flag)
     raise UserError(f"{flag}: got {shorten(name)}; wanted a folder with a {mark} in it, or the name of one in {runs}")
 

@@ -28,7 +28,7 @@ Preset = Literal["smoke", "quick", "paper"]
 class Resources(Settings):
     """What one trial takes of the cluster, all at once or not at all."""
 
-    workers: Annotated[int, Field(ge=1, le=1000)] = 1
+    workers: Annotated[int, Field(ge=1, le=1000, strict=True)] = 1
     """CPUs, with an adaptation worker and then a simulation worker on each."""
     gpus: NotNegative = 0.0
     """GPUs of each worker, which may be less than one: as many workers share one."""
@@ -77,7 +77,7 @@ class Search(Settings):
     samples: Count
     seed: Seed = 0
     """Of the samples."""
-    reduction: Annotated[int, Field(ge=2)] = 3
+    reduction: Annotated[int, Field(ge=2, strict=True)] = 3
     """Of so many trials that come as far as an evaluation on the way, one goes on."""
 
     def variants(self) -> dict[str, Overrides]:

@@ -20,7 +20,7 @@ from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.storage.redaction import error_line, redacted
 from services.storage.run_folders import find_folder
-from services.tracking.delivery import Delivery
+from services.tracking.delivery import REFUSED, Delivery
 from services.tracking.links import PORT, artifacts_beside, tracking_uri
 from services.tracking.spool import Artifact, Spool
 
@@ -81,6 +81,7 @@ def _serve(uri: str, port: int) -> NoReturn:
 
 
 def _flush(delivery: Delivery, folder: Path, uri: str) -> None:
+    delivery.take_over()  # another may have been at it until now
     before, waiting = delivery.identity.delivered, len(delivery.waiting())
     try:
         delivery.deliver()
@@ -96,6 +97,8 @@ def _flush(delivery: Delivery, folder: Path, uri: str) -> None:
     console.print(
         f"delivered: {delivery.identity.delivered - before} of {waiting} records, MLflow run {delivery.identity.run_id}"
     )
+    if (folder / REFUSED).exists():
+        console.print(f"of all, those that MLflow refuses for good are in {folder / REFUSED}, each with the reason")
 
 
 def _report(folder: Path, uri: str) -> None:

@@ -18,7 +18,7 @@ MLFLOW_DEFAULTS = {
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "0",  # a call that MLflow's client made again by itself could make a second run
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "60",  # a slow answer is no trouble for a thread
     "MLFLOW_DISABLE_TELEMETRY": "true",
-    "MLFLOW_LOGGING_LEVEL": "WARNING",  # it would print into the live screen
+    "MLFLOW_LOGGING_LEVEL": "CRITICAL",  # it would print a traceback of what it raises, into the live screen
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
 }
 MOST_BYTES = 2**26

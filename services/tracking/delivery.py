@@ -1,7 +1,9 @@
 """From a run's folder to MLflow: every record in its order, noted as delivered once MLflow has taken it."""
 
+import json
+import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from itertools import islice
 from pathlib import Path
@@ -11,8 +13,9 @@ from uuid import uuid4
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dmil_core.errors import RunError, UserError
-from dmil_core.files import read_file, sync, write_file
+from dmil_core.files import append_to, check_folder, read_file, room_for, sync, write_file
 from services.storage.folder_lock import FolderHeldError, held
+from services.storage.redaction import error_line
 from services.tracking.client import connect, set_mlflow_defaults
 from services.tracking.links import artifacts_beside
 from services.tracking.ownership import (
@@ -20,14 +23,18 @@ from services.tracking.ownership import (
     IDENTITY,
     IDENTITY_BYTES,
     RUN_TAG,
+    check_active,
     check_place,
     check_run,
+    check_there,
 )
 from services.tracking.sending import next_batch, send
 from services.tracking.spool import Line, read_spool
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
+
+logger = logging.getLogger(__name__)
 
 PARENT_TAG = "mlflow.parentRunId"
 """MLflow's own, by which its pages nest runs."""
@@ -41,6 +48,10 @@ SENDING_SECONDS = 60.0
 """So have files."""
 ID = "^[0-9a-f]{32}$"
 """Of runs, MLflow's and our own alike: they stand in questions to MLflow."""
+REFUSED = "tracking.refused.jsonl"
+"""In a run's folder: the records that MLflow will never take, each behind its number and the reason."""
+AGAIN = {401, 408, 409, 429}
+"""HTTP's refusals of a client that may be taken back."""
 LOCK = "tracking.lock"
 """Is held by the one that delivers: the run itself, or a flush."""
 
@@ -144,33 +155,59 @@ class Delivery:
         """Send every record that waits, and after each batch note how far delivery got.
 
         A batch that MLflow took before a crash kept us from noting it is sent again, which changes nothing there:
-        MLflow keeps one of equal metrics, parameters, tags and inputs.
+        MLflow keeps one of equal metrics, parameters, tags and inputs. A record that it refuses for good is put aside
+        with the reason, see `REFUSED`, and those behind it are delivered.
 
         Raises:
             UserError: if another process is at it, or a record is damaged.
+            RunError: if the folder is gone.
             MlflowException: or whatever else MLflow and what is below it raise, if it does not take a record.
         """
-        self._take_over()
+        check_folder(self._folder, "tracking.jsonl")
+        self.take_over()
         waiting = self.waiting()
         if not waiting:
             return
         client, run_id = self._open()
         while waiting:
-            batch = next_batch(waiting)
-            with self._asking(SENDING_SECONDS if batch[0].kind in {"artifact", "model"} else None):
-                send(client, run_id, self._folder, batch)
+            batch = self._send(client, run_id, next_batch(waiting))
             waiting = waiting[len(batch) :]
             # Records must not be noted as delivered that a power failure would take back.
             sync(self._folder / "tracking.jsonl")
             self._offset = batch[-1].end
             self._note(delivered=batch[-1].number)
 
+    def _send(self, client: "MlflowClient", run_id: str, batch: Sequence[Line]) -> Sequence[Line]:
+        """Send records that go into one call, fewer if one of them is refused, and return those that are done with."""
+        try:
+            with self._asking(SENDING_SECONDS if batch[0].kind in {"artifact", "model"} else None):
+                send(client, run_id, self._folder, batch)
+        except Exception as error:
+            if not _is_for_good(error):
+                raise
+            with self._asking():
+                check_there(client, run_id)
+            if len(batch) > 1:
+                return self._send(client, run_id, batch[: len(batch) // 2])
+            self._put_aside(batch[0], error)
+        return batch
+
+    def _put_aside(self, line: Line, error: Exception) -> None:
+        value = line.value.model_dump() if isinstance(line.value, BaseModel) else line.value
+        text = json.dumps([line.number, error_line(error), line.kind, value]).encode() + b"\n"
+        with room_for(self._folder / REFUSED, len(text)), append_to(self._folder, REFUSED) as file:
+            file.write(text)
+        logger.warning(
+            f"MLflow refuses record {line.number}, {line.kind}, for good ({error_line(error)}); it is kept in "
+            f"{self._folder / REFUSED}, and the others are delivered"
+        )
+
     def close(self) -> None:
         """Let others deliver."""
         self._holding.close()
         self._is_ours = False
 
-    def _take_over(self) -> None:
+    def take_over(self) -> None:
         """Be the one that delivers, from where the last one left off."""
         if self._is_ours:
             return
@@ -211,6 +248,7 @@ class Delivery:
         with self._asking():
             found = client.get_experiment_by_name(name)
             if found:
+                check_active(found)
                 check_place(client, self._uri, found)
                 return found.experiment_id
         beside = artifacts_beside(self._uri)
@@ -256,6 +294,16 @@ class Delivery:
         except ValidationError as error:
             raise RunError(f"MLflow answered with no id of its own: {'; '.join(_problems(error))}") from error
         write_file(self._folder, IDENTITY, self.identity.model_dump_json())
+
+
+def _is_for_good(error: Exception) -> bool:
+    """Tell whether MLflow would refuse a record again however often it is sent."""
+    from mlflow.exceptions import MlflowException
+
+    if not isinstance(error, MlflowException):
+        return False
+    status = error.get_http_status_code()
+    return 400 <= status < 500 and status not in AGAIN
 
 
 def _problems(error: ValidationError) -> Iterator[str]:

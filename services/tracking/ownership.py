@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from dmil_core.errors import UserError
+from dmil_core.errors import RunError, UserError
 from dmil_core.files import read_file
 from services.storage.redaction import redacted
 from services.tracking.links import artifacts_beside
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
-    from mlflow.entities import Experiment, LoggedModel
+    from mlflow.entities import Experiment, LoggedModel, Run
 
 RUN_TAG = "dmil.run"
 """The tag by which a run is found again whose id was never noted."""
@@ -54,6 +54,35 @@ def check_place(client: "MlflowClient", uri: str, experiment: "Experiment") -> N
         )
 
 
+def check_active(experiment: "Experiment") -> None:
+    """Refuse an experiment that was deleted in MLflow, which keeps it in its trash.
+
+    Raises:
+        RunError: names the command that restores it.
+    """
+    if experiment.lifecycle_stage == "deleted":
+        raise RunError(
+            f"MLflow's experiment {experiment.name!r} was deleted there; records wait until it is restored: mlflow "
+            f"experiments restore --experiment-id {experiment.experiment_id}"
+        )
+
+
+def check_there(client: "MlflowClient", run_id: str) -> "Run":
+    """Return a run, unless it or its experiment was deleted in MLflow.
+
+    Raises:
+        RunError: names the command that restores it.
+    """
+    run = client.get_run(run_id)
+    check_active(client.get_experiment(run.info.experiment_id))
+    if run.info.lifecycle_stage == "deleted":
+        raise RunError(
+            f"MLflow's run {run_id} was deleted there; records wait until it is restored: mlflow runs restore --run-id "
+            f"{run_id}"
+        )
+    return run
+
+
 def check_model(client: "MlflowClient", uri: str, model: "LoggedModel") -> None:
     """Refuse a model whose files are not among the artifacts of its experiment.
 
@@ -81,8 +110,9 @@ def check_run(client: "MlflowClient", uri: str, folder: Path, run_id: str, tag: 
 
     Raises:
         UserError: if the run has another tag, artifacts in a strange place, or a folder that is still there.
+        RunError: if it was deleted.
     """
-    run, here = client.get_run(run_id), folder.resolve()
+    run, here = check_there(client, run_id), folder.resolve()
     if run.data.tags.get(RUN_TAG) != tag:
         raise _stranger(folder, f"got the MLflow run {run_id}, which has another tag {RUN_TAG} than this folder's")
     check_place(client, uri, client.get_experiment(run.info.experiment_id))

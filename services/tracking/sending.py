@@ -1,12 +1,15 @@
 """Records as calls of MLflow."""
 
-from collections.abc import Iterator, Sequence
+import logging
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, TypeVar
 
 from dmil_core.checkpoint import Checkpoint, CheckpointError
+from dmil_core.checksums import sha256
 from dmil_core.files import ForeignFileError, copy_plain, inside
 from services.tracking.models import log_model
 from services.tracking.spool import Artifact, Line, Measured, Trained
@@ -14,12 +17,25 @@ from services.tracking.spool import Artifact, Line, Measured, Trained
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
+logger = logging.getLogger(__name__)
 T = TypeVar("T")
+LONGEST_KEY = 250
+"""Of a metric's, a parameter's and a tag's name, in MLflow."""
+DIGITS = 12
+"""Of a digest, in a name that was cut."""
 METRICS_PER_CALL = 1000
 """What MLflow takes in one batch."""
 TEXTS_PER_CALL = 100
 LONGEST_NAME = 500
 """Of a data set, in MLflow."""
+
+
+def acceptable(name: str) -> str:
+    """Return a name as MLflow takes one of a metric, a parameter or a tag: other characters become underscores."""
+    plain = re.sub(r"[^\w\-./: ]", "_", name)
+    if len(plain) > LONGEST_KEY:
+        plain = f"{plain[: LONGEST_KEY - DIGITS - 1]}-{sha256(name.encode())[:DIGITS]}"
+    return "/".join(part for part in plain.split("/") if part.strip(".")) or "_"
 
 
 def next_batch(waiting: Sequence[Line]) -> Sequence[Line]:
@@ -44,9 +60,11 @@ def send(client: "MlflowClient", run_id: str, folder: Path, batch: Sequence[Line
             client.update_run(run_id, status="RUNNING")
         case "metrics" | "system":
             measured = [line.value for line in batch]
+            names = {name: acceptable(name) for one in measured for name in one.values}
             metrics = [
-                Metric(name, value, one.time, one.step) for one in measured for name, value in one.values.items()
+                Metric(names[name], value, one.time, one.step) for one in measured for name, value in one.values.items()
             ]
+            _tell_renamed(client, run_id, names)
             for part in _parts(metrics, METRICS_PER_CALL):
                 client.log_batch(run_id, metrics=part, synchronous=True)
         case "parameters":
@@ -67,6 +85,8 @@ def send(client: "MlflowClient", run_id: str, folder: Path, batch: Sequence[Line
 def _send_parameters(client: "MlflowClient", run_id: str, values: dict[str, str]) -> None:
     from mlflow.entities import Param
 
+    _tell_renamed(client, run_id, names := {name: acceptable(name) for name in values})
+    values = {names[name]: value for name, value in values.items()}
     there = client.get_run(run_id).data.params
     for part in _parts([Param(name, values[name]) for name in values.keys() - there], TEXTS_PER_CALL):
         client.log_batch(run_id, params=part, synchronous=True)
@@ -74,10 +94,20 @@ def _send_parameters(client: "MlflowClient", run_id: str, values: dict[str, str]
     _send_tags(client, run_id, changed)
 
 
+def _tell_renamed(client: "MlflowClient", run_id: str, names: Mapping[str, str]) -> None:
+    """Note as tags which names were changed."""
+    renamed = {f"renamed.{new}": old for old, new in names.items() if old != new}
+    if renamed:
+        logger.info(
+            f"MLflow has no such names; changed: {', '.join(f'{old} to {names[old]}' for old in renamed.values())}"
+        )
+    _send_tags(client, run_id, renamed)
+
+
 def _send_tags(client: "MlflowClient", run_id: str, values: dict[str, str]) -> None:
     from mlflow.entities import RunTag
 
-    for part in _parts([RunTag(name, value) for name, value in values.items()], TEXTS_PER_CALL):
+    for part in _parts([RunTag(acceptable(name), value) for name, value in values.items()], TEXTS_PER_CALL):
         client.log_batch(run_id, tags=part, synchronous=True)
 
 

@@ -81,7 +81,7 @@ class Tracker:
     @property
     def waiting(self) -> int:
         """How many records MLflow has not taken yet."""
-        return self._spool.count - self._delivery.identity.delivered
+        return max(0, self._spool.count - self._delivery.identity.delivered)
 
     def parameters(self, values: Mapping[str, Any]) -> None:
         """Record settings; MLflow keeps the first value of each, a resumed run's other value becomes a tag."""

@@ -60,7 +60,7 @@ def test_a_stopped_job_has_its_checkpoint_and_goes_on_to_the_same_bits(submit, j
     wait_for(lambda: bool(progress.search(job("logs", "stopped"))), "meta-training in the job's log")
     job("stop", "stopped")
     logs = job("logs", "stopped")
-    assert "stopped; to go on: python -m services.meta_train --resume" in logs
+    assert "stopped; to go on: dmil meta-train --resume" in logs
     iteration = Checkpoints(workplace / "runs" / "job" / "checkpoints", kept=1).newest().manifest.iteration
     assert iteration >= int(progress.findall(logs)[-1])
 

@@ -146,17 +146,17 @@ def test_a_run_that_was_stopped_before_its_first_checkpoint_begins_anew(workplac
 
 
 @pytest.mark.parametrize(
-    ("flag", "section"),
+    ("flag", "key"),
     [
-        (("--method.sub-skills", "4"), "method"),
+        (("--method.sub-skills", "4"), "method.sub_skills"),
         (("--seed", "1"), "seed"),
-        (("--training.learning-rate", "0.5"), "training"),
-        (("--demonstrations.held-out", "5"), "demonstrations"),
+        (("--training.learning-rate", "0.5"), "training.learning_rate"),
+        (("--demonstrations.held-out", "5"), "demonstrations.held_out"),
     ],
 )
-def test_going_on_with_other_settings_is_refused(copied_run, train, flag: tuple[str, str], section: str):
+def test_going_on_with_other_settings_is_refused(copied_run, train, flag: tuple[str, str], key: str):
     copied_run(0)
-    with pytest.raises(UserError, match=f"--resume: got other settings of {section} than the run began with"):
+    with pytest.raises(UserError, match=f"--resume: got other settings of {key} than the run began with"):
         train("run", *flag, resume=True)
 
 
@@ -210,7 +210,7 @@ def test_a_stopped_run_goes_on_with_the_same_bits(
     (os.killpg if number == signal.SIGINT else os.kill)(program.pid, number)
     printed, _ = program.communicate()
     assert program.returncode == wanted, printed
-    assert "stopped; to go on: python -m services.meta_train --resume runs/run" in printed
+    assert "stopped; to go on: dmil meta-train --resume runs/run" in printed
     assert "Traceback" not in printed
     monkeypatch.delenv("DMIL_TEST_SESSION")
     wait_for(lambda: not descendants(session), f"the end of {descendants(session)}")

@@ -17,13 +17,13 @@ from dmil_core.settings import (
     Size,
 )
 
-Iterations = Annotated[int, Field(ge=0, le=10**9)]
+Iterations = Annotated[int, Field(ge=0, le=10**9, strict=True)]
 
 
 class OptionConfig(HierarchicalConfig, NetworkConfig):
     """Base of both: the option model and its maximum likelihood."""
 
-    least_log_deviation: Annotated[float, Field(le=0, allow_inf_nan=False)] = -20.0
+    least_log_deviation: Annotated[float, Field(le=0, allow_inf_nan=False, strict=True)] = -20.0
     """Lower bound of log σ of an option's actions; the upper bound is 0."""
     trajectories: Size = 16
     """Whole demonstrations that a slot draws from its task (Table 9)."""
@@ -77,7 +77,7 @@ class OptionGailConfig(OptionConfig):
     """Epochs of PPO over the policy's steps in an adversarial iteration."""
     discount: Probability = 0.99
     """Discount γ."""
-    smoothing: Annotated[float, Field(ge=0, le=1)] = 0.95
+    smoothing: Annotated[float, Field(ge=0, le=1, strict=True)] = 0.95
     """λ of generalised advantage estimation."""
     clip: Positive = 0.2
     """Clip range ε of PPO's probability ratio at both levels."""

@@ -17,7 +17,7 @@ class PemirlConfig(NetworkConfig):
     """Hidden layers of ReLU units in reward and potential (F.2)."""
     context_dim: Size = 3
     """Size of the context m, as in the original."""
-    initial_deviation: Annotated[float, Field(ge=0.01, le=10)] = 0.3
+    initial_deviation: Annotated[float, Field(ge=0.01, le=10, strict=True)] = 0.3
     """Initial standard deviation σ of the policy, in the environment's units."""
     trajectories: Size = 16
     """Trajectories of each task whose actions are predicted (Table 12)."""

@@ -77,7 +77,7 @@ def test_a_terminal_shows_one_screen_and_is_left_as_it_was(terminal: Terminal):
     sent += terminal.read(lambda sent: False)
     assert program.wait() == 130
     assert "Traceback" not in sent
-    assert "stopped; to go on: python -m services.meta_train --resume runs/run" in sent
+    assert "stopped; to go on: dmil meta-train --resume runs/run" in sent
     assert sent.rindex(SHOWN) > sent.rindex(HIDDEN)
     after = sent[sent.rindex(SHOWN) :]
     assert "losses " not in after

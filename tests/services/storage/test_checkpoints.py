@@ -181,7 +181,7 @@ def test_where_none_is_whole_the_folder_is_named_and_each_fault(tmp_path: Path):
         (save(checkpoints, start()._replace(iteration=iteration)) / "optimiser.safetensors").unlink()
     with pytest.raises(CheckpointError, match=f"{tmp_path}: got 2 checkpoints, none of them whole") as error:
         checkpoints.newest()
-    assert "start the run anew" in str(error.value)
+    assert "remove them and begin anew" in str(error.value)
     assert str(error.value).count("optimiser.safetensors: got 0 bytes") == 2
 
 
