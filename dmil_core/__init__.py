@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from dmil_core.adapted_policy import AdaptedPolicy, load_policy
     from dmil_core.demonstrations import Demonstration, DemonstrationError
     from dmil_core.errors import RunError, UserError
-    from dmil_core.model import DivergedError, Model, UnlikeTrainingWarning, load
+    from dmil_core.model import DivergedError, Model, UnlikeTrainingWarning, load, track
+    from dmil_core.points import Points
 
 _PLACES = {
     "AdaptedPolicy": "adapted_policy",
@@ -27,11 +28,13 @@ _PLACES = {
     "DemonstrationError": "demonstrations",
     "DivergedError": "model",
     "Model": "model",
+    "Points": "points",
     "RunError": "errors",
     "UnlikeTrainingWarning": "model",
     "UserError": "errors",
     "load": "model",
     "load_policy": "adapted_policy",
+    "track": "model",
 }
 __all__ = [
     "AdaptedPolicy",
@@ -39,11 +42,13 @@ __all__ = [
     "DemonstrationError",
     "DivergedError",
     "Model",
+    "Points",
     "RunError",
     "UnlikeTrainingWarning",
     "UserError",
     "load",
     "load_policy",
+    "track",
 ]
 
 

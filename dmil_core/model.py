@@ -9,13 +9,17 @@ import numpy as np
 import torch
 
 from dmil_core.adapted_policy import AdaptedPolicy, Origin
-from dmil_core.checkpoint import FOLDER, MANIFEST, Checkpoint, Range, opened
+from dmil_core.checkpoint import FOLDER, MANIFEST, Checkpoint, Manifest, Range, opened
+from dmil_core.configs import ExperimentConfig, SuiteConfig, TrainingConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import RunError, UserError, shorten
 from dmil_core.methods.base import FineTuning, Policy
+from dmil_core.methods.tracking.config import TrackingConfig
+from dmil_core.methods.tracking.method import Tracking
 from dmil_core.plug_ins import imported, plug_ins
+from dmil_core.points import Points
 from dmil_core.policy_tensors import tensors_of
-from dmil_core.recorded import Interface, as_demonstrations, unlike_training
+from dmil_core.recorded import Interface, action_dim_of, as_demonstrations, unlike_training
 
 ENTRY_POINTS = "dmil.models"
 """The group of entry points in which a package registers, by the scheme of an address, what reads a checkpoint:
@@ -74,13 +78,7 @@ class Model:
         manifest = self.checkpoint.manifest.model_copy(update={"actions": actions})
         interface = Interface.of(manifest, method)
         support = as_demonstrations(demonstrations, interface)
-        if odd := unlike_training(support, interface):
-            warnings.warn(
-                f"unlike meta-training, {interface.trained_on}: {'; '.join(odd)}; see to units, order and sensors "
-                "before a robot moves",
-                UnlikeTrainingWarning,
-                stacklevel=2,
-            )
+        _warn(support, interface)
         policy = method.adapt(self._parameters, support, fine_tuning)
         if (error := _error(policy, support)) > _width(support, actions):
             before = _error(method.adapt(self._parameters, support, fine_tuning._replace(steps=0)), support)
@@ -92,6 +90,40 @@ class Model:
                     "demonstrations are in the units of meta-training"
                 )
         return AdaptedPolicy(policy, Origin(manifest, self.checkpoint.constants, support, fine_tuning, interface))
+
+
+def track(demonstrations: Sequence[Any], points: Points, *, low: float = -1.0, high: float = 1.0) -> AdaptedPolicy:
+    """Return the tracker of what some demonstrations show: no checkpoint is needed, and nothing is learned.
+
+    The demonstrated path of the hand is followed, shifted by the object and the goal.
+
+    Args:
+        demonstrations: of one task, one or more, as `Model.adapt` takes them.
+        points: which numbers of an observation are positions.
+        low: the least number of an action.
+        high: the greatest.
+
+    Warns:
+        UnlikeTrainingWarning: names the numbers of actions outside these bounds, where acting clips them.
+
+    Raises:
+        UserError: for what is no demonstration, or points that its observations do not have.
+    """
+    count = action_dim_of(demonstrations)
+    actions = Range.of(np.full(count, float(low)), np.full(count, float(high)))
+    interface = Interface(points.size, actions, None, "as points.size says, and as the first demonstration has it")
+    support = as_demonstrations(demonstrations, interface)
+    _warn(support, interface)
+    config = ExperimentConfig(
+        suite=SuiteConfig(name="own", points=points), method=TrackingConfig(), training=TrainingConfig(iterations=0)
+    )
+    method = Tracking.prepared(TrackingConfig(), count, support, points)
+    manifest = Manifest(
+        iteration=0, loss=None, config=config, shapes={}, data={}, versions={}, mlflow_run_id=None, actions=actions
+    )
+    fine_tuning = config.evaluation.fine_tuning._replace(steps=0)
+    policy = method.adapt({}, support, fine_tuning)
+    return AdaptedPolicy(policy, Origin(manifest, method.constants(), support, fine_tuning, interface))
 
 
 def load(name: str | Path, runs: str | Path = "runs") -> Model:
@@ -130,6 +162,17 @@ def _fetched(scheme: str, address: str) -> Checkpoint:
             "project with its services for MLflow's"
         )
     return imported(sources[scheme], "name")(address)
+
+
+def _warn(support: Sequence[Demonstration], interface: Interface) -> None:
+    """Warn whoever called `Model.adapt` or `track` of what stands out."""
+    if odd := unlike_training(support, interface):
+        warnings.warn(
+            f"unlike meta-training, {interface.trained_on}: {'; '.join(odd)}; see to units, order and sensors before a "
+            "robot moves",
+            UnlikeTrainingWarning,
+            stacklevel=3,
+        )
 
 
 @torch.no_grad()

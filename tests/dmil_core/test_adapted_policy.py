@@ -78,6 +78,35 @@ def test_an_observation_that_cannot_be_acted_on_is_refused_and_forgotten():
         np.testing.assert_array_equal(policy(observation), undisturbed(observation))
 
 
+POINTS = dmil.Points(size=8, hand=(0, 1), object=(2, 3), goal=(6, 7), reach=0.05)
+
+
+def reaching() -> tuple[np.ndarray, np.ndarray]:
+    """Return a demonstration of a hand that goes straight to its object, 0.05 a step by an action of 1."""
+    hand, object_ = np.zeros(2), np.array([0.5, 0.25])
+    observations, actions = [], []
+    for _ in range(14):
+        action = np.clip((object_ - hand) / 0.05, -1, 1)
+        observations.append([*hand, *object_, 0.3, 0.3, 0, 0])
+        actions.append(action)
+        hand = hand + 0.05 * action
+    return np.array(observations), np.array(actions)
+
+
+def test_a_demonstrated_path_is_tracked_without_a_checkpoint(tmp_path: Path):
+    policy = dmil.track([reaching()], points=POINTS)
+    policy.save(tmp_path / "reach")
+    for one in (policy, dmil.load_policy(tmp_path / "reach")):
+        hand, object_ = np.array([0.1, -0.1]), np.array([0.3, 0.3])
+        for _ in range(40):
+            hand = hand + 0.05 * one([*hand, *object_, 0.3, 0.3, 0, 0])
+        np.testing.assert_allclose(hand, object_, atol=0.02)
+    with pytest.warns(dmil.UnlikeTrainingWarning, match=r"action: number 0 .*, wanted -0.5 to 0.5"):
+        assert dmil.track([reaching()], points=POINTS, low=-0.5, high=0.5)(reaching()[0][0]).max() <= 0.5
+    with pytest.raises(dmil.DemonstrationError, match=r"got the shape \(14, 7\); wanted \(steps, 8\), as points"):
+        dmil.track([(reaching()[0][:, :7], reaching()[1])], points=POINTS)
+
+
 def test_what_is_no_policys_folder_is_refused(tmp_path: Path):
     policy_of().save(whole := tmp_path / "peg")
     with pytest.raises(dmil.UserError, match=r"folder: got .*peg, which is there already; wanted a new name"):

@@ -1,9 +1,11 @@
 """From a checkpoint and a few arrays to a policy: whatever was meant works, whatever was not is named."""
 
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -138,6 +140,21 @@ def test_a_model_is_found_by_a_runs_name_its_folder_or_a_checkpoints(tmp_path: P
     assert dmil.load(FOLDER / "nearest-neighbour")
     with pytest.raises(dmil.UserError, match=r"got no actions; wanted their bounds, which version 0.1 did not write"):
         dmil.load(FOLDER / "nearest-neighbour").adapt([])
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/use-a-policy.md", "docs/data.md"])
+def test_the_code_of_a_page_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    shutil.copytree(FOLDER / "dmil", tmp_path / "runs" / "ml45" / "checkpoints" / "iteration-0000001")
+    monkeypatch.chdir(tmp_path)
+    (observations, actions), *_ = recorded(old_model())
+    robot = SimpleNamespace(send=len, observe=lambda: observations[0], stop=list)
+    namespace = {"observations": observations, "actions": actions, "observation": observations[0], "robot": robot}
+    blocks = re.findall(r"```python\n(.*?)```", (FOLDER.parents[3] / page).read_text(), re.DOTALL)
+    assert blocks
+    for block in blocks:
+        exec(block.replace("range(400)", "range(2)"), namespace)
+    if page == "docs/data.md":
+        assert dict(np.load("mine.npz"))["episode_lengths"].tolist() == [20] * 3
 
 
 def test_the_door_knows_no_simulator_no_ray_and_no_mlflow_and_opens_without_torch():
