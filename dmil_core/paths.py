@@ -33,9 +33,10 @@ def way(demonstration: Demonstration, points: Points) -> Float32[np.ndarray, " s
 def goal_weight(demonstration: Demonstration, points: Points) -> Float32[np.ndarray, " steps"]:
     """Return how much the goal's displacement, in place of the object's, moves the path at each step, from 0 to 1.
 
-    Where the object never moves the goal is all there is to go to, from the first step on.
+    Where the object never moves the goal is all there is to go to, from the first step on; where no goal is seen, the
+    path stays with the object.
     """
-    if points.goal is None:
+    if not present(demonstration.observations, points.goal, points).all():
         return np.zeros(len(demonstration), np.float32)
     begun, gone = contact(demonstration, points), way(demonstration, points)
     begun = 0 if begun == len(demonstration) else begun

@@ -99,7 +99,8 @@ def action_dim_of(recorded: Any) -> int:
     """Return how many numbers the actions of the first recorded demonstration have; 1 if that is no demonstration."""
     one = next(iter(recorded), None)
     actions = getattr(one, "actions", one[1] if isinstance(one, Sequence) and len(one) == 2 else 0)
-    return np.shape(actions)[-1] if np.ndim(actions) == 2 else 1
+    shape: tuple[int, ...] = np.shape(actions)
+    return shape[1] if len(shape) == 2 else 1
 
 
 def _demonstration(one: Any, index: int, interface: Interface) -> Demonstration:
