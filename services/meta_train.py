@@ -87,6 +87,7 @@ def run(arguments: Sequence[str]) -> None:
         demonstrations=(store.root, f"{DATA}=FOLDER"),
         MLflow=(database(tracking_uri()), "MLFLOW_TRACKING_URI=sqlite:///FILE"),
     )
+    experiment.read_sources()
     if args.resume is None:
         make_folder(folder)
         claim_name(folder)

@@ -1,8 +1,10 @@
 """Where an experiment's demonstrations come from: the store, data sets of one's own, or the scripted experts."""
 
+import logging
 from collections import Counter
 from collections.abc import Generator, Sequence
 from contextlib import closing
+from functools import cached_property
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import DemonstrationError
@@ -15,6 +17,8 @@ from services.distributed.failures import keeping_failures
 from services.distributed.runner import Runner
 from services.distributed.work_items import ExpertAttempts
 from services.suites.base import TaskSuite
+
+logger = logging.getLogger(__name__)
 
 CHUNK = 10
 """Attempts of an expert in one call to a simulation worker."""
@@ -50,7 +54,7 @@ class DemonstrationCollection:
             DemonstrationError: if an expert hardly ever succeeds, a task has none, or a data set cannot be used.
         """
         settings = self._config.demonstrations
-        datasets = self._recorded()
+        datasets = dict(self.recorded)
         wanted = [task for task in self._names if task not in datasets]
         ids = {task: self._store.dataset_id(task, self._suite, settings) for task in wanted}
         missing = []
@@ -99,20 +103,27 @@ class DemonstrationCollection:
             )
         return places
 
-    def _recorded(self) -> dict[str, TaskDemonstrations]:
-        """Read the data sets that the settings name."""
+    @cached_property
+    def recorded(self) -> dict[str, TaskDemonstrations]:
+        """The data sets that the settings name, read once.
+
+        Raises:
+            DemonstrationError: for one that cannot be used, or has too few demonstrations.
+        """
         settings, evaluation = self._config.demonstrations, self._config.evaluation
         datasets = {task: demonstrations(task, at, self._suite, settings.per_task) for task, at in self._places.items()}
-        support = max(evaluation.shots) * evaluation.support_draws
+        shots = max(evaluation.shots)
         for task, dataset in datasets.items():
-            wanted = settings.held_out + 1 if task in self._suite.train_tasks else support
+            wanted = settings.held_out + 1 if task in self._suite.train_tasks else shots
             if (got := len(dataset.demonstrations)) < wanted:
                 raise DemonstrationError(
-                    f"{dataset.id}: got {got} demonstrations of {task}; wanted at least {wanted}: {support} for "
-                    f"{evaluation.support_draws} support sets of {max(evaluation.shots)}, and for a meta-training task "
-                    "one more than demonstrations.held_out; record more, or lower that, evaluation.shots or "
-                    "evaluation.support_draws"
+                    f"{dataset.id}: got {got} demonstrations of {task}; wanted at least {wanted}: {shots} for a "
+                    "support set, and for a meta-training task one more than demonstrations.held_out; record more, or "
+                    "lower that or evaluation.shots"
                 )
+            if got < shots * evaluation.support_draws and task not in self._suite.train_tasks:
+                sets = ", ".join(f"{got // size} of {size}" for size in evaluation.shots)
+                logger.info(f"{dataset.id}: {got} demonstrations of {task} make these disjoint support sets: {sets}")
         return datasets
 
     def _attempt(self, runner: Runner, tasks: Sequence[str]) -> Generator[tuple[str, list[Episode]]]:

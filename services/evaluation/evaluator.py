@@ -86,7 +86,7 @@ class Evaluator:
             held_out: of each task, those that support sets are drawn from.
         """
         self._runner, self.config, self._suite, self._data, self._held_out = runner, config, suite, data, held_out
-        self.adaptations = plan_adaptations(tasks, config.evaluation)
+        self.adaptations = plan_adaptations(tasks, config.evaluation, {task: len(held_out[task]) for task in held_out})
         self._shared = {task: runner.share(demonstrations) for task, demonstrations in held_out.items()}
 
     def is_due(self, iteration: int) -> bool:

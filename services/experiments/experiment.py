@@ -76,6 +76,14 @@ class Experiment:
 
     # Demonstrations
 
+    def read_sources(self) -> None:
+        """Read the data sets that the settings name, so that what is wrong with one is said before anything is made.
+
+        Raises:
+            DemonstrationError: as `collect`.
+        """
+        _ = self._collection.recorded
+
     def collect(self, runner: Runner) -> dict[str, TaskDemonstrations]:
         """Return every task's demonstrations, see `DemonstrationCollection`.
 

@@ -1,6 +1,6 @@
 """Episodes of a policy or an expert in a suite's environments: pure, named by their seeds, no Ray."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import compress
 from typing import NamedTuple
 
@@ -60,13 +60,27 @@ def imitation_error(policy: Policy, demonstrations: Sequence[Demonstration]) -> 
     return total / sum(map(len, demonstrations))
 
 
-def plan_adaptations(tasks: Sequence[tuple[Split, str]], evaluation: EvaluationConfig) -> list[Adaptation]:
-    """Return all adaptations of an evaluation, a task's episodes spread over its support sets."""
+def plan_adaptations(
+    tasks: Sequence[tuple[Split, str]], evaluation: EvaluationConfig, held_out: Mapping[str, int] | None = None
+) -> list[Adaptation]:
+    """Return all adaptations of an evaluation, a task's episodes spread over its support sets.
+
+    Args:
+        tasks: with their split.
+        evaluation: how many sets, of what sizes, and how many episodes.
+        held_out: how many demonstrations of a task support sets are drawn from, where there may be too few for
+            `EvaluationConfig.support_draws` disjoint ones: then there are as many as they make.
+    """
+
+    def draws(task: str, shots: int) -> int:
+        enough = evaluation.support_draws if held_out is None else held_out[task] // shots
+        return min(evaluation.support_draws, evaluation.episodes, enough)
+
     return [
-        Adaptation(split, task, shots, draw, tuple(range(draw, evaluation.episodes, evaluation.support_draws)))
+        Adaptation(split, task, shots, draw, tuple(range(draw, evaluation.episodes, draws(task, shots))))
         for split, task in tasks
         for shots in evaluation.shots
-        for draw in range(min(evaluation.support_draws, evaluation.episodes))
+        for draw in range(draws(task, shots))
     ]
 
 

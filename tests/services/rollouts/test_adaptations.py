@@ -184,6 +184,16 @@ def test_episodes_are_spread_evenly_over_disjoint_support_sets(episodes: int, dr
             assert len(support) == len(set(support)) == shots * len(of_one)
 
 
+def test_few_demonstrations_make_as_many_disjoint_support_sets_as_they_can():
+    settings = EvaluationConfig(shots=(1, 2, 3), episodes=6, support_draws=4)
+    plan = plan_adaptations([("meta-testing", "push")], settings, {"push": 5})
+    assert [(one.shots, one.draw, one.episodes) for one in plan] == [
+        (1, 0, (0, 4)), (1, 1, (1, 5)), (1, 2, (2,)), (1, 3, (3,)),
+        (2, 0, (0, 2, 4)), (2, 1, (1, 3, 5)),
+        (3, 0, (0, 1, 2, 3, 4, 5)),
+    ]  # fmt: skip
+
+
 class Remembering(Policy):
     """Does in each step as many units as it has taken steps."""
 
