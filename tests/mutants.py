@@ -97,7 +97,7 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
         "end = min(horizon, recorder.solved_at": "end = max(horizon, recorder.solved_at",
     },
     ("services/rollouts/adaptations.py", "services/rollouts"): {
-        "range(draw, evaluation.episodes, evaluation.support_draws)": "range(draw, evaluation.episodes)",
+        "range(draw, evaluation.episodes, draws(task, shots))": "range(draw, evaluation.episodes)",
     },
     ("services/demonstrations/npz.py", "services/demonstrations/test_npz.py"): {
         "(lengths < 1).any()": "(lengths < 0).any()",
