@@ -268,10 +268,10 @@ def one_policy(
             seed += 1
     support = [demonstration for of_task in demonstrations.values() for demonstration in of_task]
     assert isinstance(config.method, DmilConfig)
-    method = Dmil.prepared(config.method, suite.action_dim, support)
+    method = Dmil.prepared(config.method, suite.action_dim, support, suite.points)
     initial = method.initial_parameters(named_rng(config.seed, "initial parameters"))
     policy = method.adapt(initial, support, FineTuning(steps, config.evaluation.learning_rate))
-    return method, policy.hierarchy.parameters, demonstrations
+    return method, {**initial, **policy.hierarchy.parameters}, demonstrations
 
 
 def start_worker(suite: MetaWorldSuite) -> None:

@@ -83,7 +83,8 @@ def made_up_plan(preset: str, slots_per_group: int | None = None) -> Plan:
         for task in suite.train_tasks
     }
     assert isinstance(config.method, DmilConfig)
-    method = Dmil.prepared(config.method, suite.action_dim, [d for task in demonstrations.values() for d in task])
+    everything = [one for task in demonstrations.values() for one in task]
+    method = Dmil.prepared(config.method, suite.action_dim, everything, suite.points)
     initial = method.initial_parameters(named_rng(0, "initial parameters"))
     shapes = {name: tensor.shape for name, tensor in initial.items()}
     if slots_per_group is not None:

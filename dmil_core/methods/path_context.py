@@ -153,7 +153,7 @@ class PathContext:
         """
         compared, anywhere = self.view.match(observations), self.view.anywhere(observations)
         rows = [self._row(observations, compared, anywhere, seen, rng) for seen in self.seen]
-        return torch.from_numpy(np.stack(rows, 1).reshape(len(observations) * len(rows), -1))
+        return torch.from_numpy(np.stack(rows, 1).reshape(len(observations) * len(rows), rows[0].shape[1]))
 
     def _row(
         self,
@@ -175,7 +175,8 @@ class PathContext:
         for places, axes in seen.frames:
             shift = position(observations, axes, points) - places[nearest]
             error = seen.ahead[nearest] + shift[:, None] - hand[:, None]
-            parts += [part.reshape(len(observations), -1) for part in _scaled(error, points.reach)]
+            numbers = len(HORIZONS) * len(points.hand)
+            parts += [part.reshape(len(observations), numbers) for part in _scaled(error, points.reach)]
         parts += [seen.actions[nearest], seen.others[nearest]]
         parts += [np.abs(seen.compared[nearest] - compared).mean(1, keepdims=True)]
         parts += [anywhere, anywhere - seen.anywhere[nearest]]

@@ -76,7 +76,7 @@ def test_sizing(tmp_path: Path) -> None:
     assert [(row["workers"], row["used"], row["slots"]) for row in fixed] == [(1, 1, 10), (2, 2, 10), (1000, 2, 10)]
     assert [(row["workers"], row["used"], row["slots"]) for row in each] == [(1, 1, 5), (2, 2, 10), (1000, 1000, 5000)]
     one, two, thousand = fixed
-    assert thousand["iteration"] == two["iteration"] < one["iteration"] == pytest.approx(one["hours"] * 3600 / 4000)
+    assert thousand["iteration"] == two["iteration"] < one["iteration"] == pytest.approx(one["hours"] * 3600 / 2500)
     assert (one["efficiency"], thousand["dollars"]) == (1, pytest.approx(500 * two["dollars"]))
     assert each[2]["sent"] > each[0]["sent"] == 0
     assert 0 < each[2]["tree"] < each[2]["alone"]

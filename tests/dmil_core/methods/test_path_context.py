@@ -102,6 +102,12 @@ def test_a_set_never_sees_itself() -> None:
         assert batch.query
 
 
+def test_no_episode_at_all_is_acted_in_too(dmil: Dmil) -> None:
+    policy = dmil.adapt(dmil.initial_parameters(named_rng(0, "initial")), DEMONSTRATIONS[:3], FineTuning(1, 0.1))
+    decision = policy.act(DEMONSTRATIONS[0].observations[:0], policy.start(0))
+    assert decision.actions.shape == (0, 4)
+
+
 def test_equal_demonstrations_share_the_weight() -> None:
     outputs = torch.tensor([[1.0, 2.0, 0.0], [3.0, 4.0, 0.0], [5.0, 0.0, 90.0], [7.0, 8.0, 0.0]])
     torch.testing.assert_close(combined(outputs, 2), torch.tensor([[2.0, 3.0], [5.0, 0.0]]))
