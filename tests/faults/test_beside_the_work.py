@@ -21,6 +21,16 @@ from services.storage.checkpoints import Checkpoints
 from tests.faults.conftest import SHORT, TOY
 
 
+@pytest.fixture(autouse=True)
+def heeded_signals():
+    """Let signals be as a terminal leaves them: whoever runs the tests in the background may have them ignored."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGHUP: signal.SIG_DFL, signal.SIGTERM: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 def names(folder: Path) -> list[str]:
     return [path.name for path in Checkpoints(folder / "checkpoints", 3).all()]
 

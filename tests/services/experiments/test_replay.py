@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from dmil_core.errors import UserError
 from services.evaluation.results import EpisodeResult, write_rows
 from services.experiments.finished_run import FinishedRun
-from services.experiments.replay import Replay, ReplayError, replaying
+from services.experiments.replay import Replay, replaying
 from services.rollouts.recording import VideoSettings
 from services.suites.rendering import RenderingError
 
@@ -71,11 +72,11 @@ def test_its_demonstration_is_the_one_that_was_adapted_to(finished: FinishedRun)
 @pytest.mark.parametrize(
     ("field", "wrong", "words"),
     [
-        ("checkpoint", "f" * 64, "the episodes are of ffffffffffff; evaluate the run's end"),
+        ("checkpoint", "f" * 64, "checkpoint: got rows of ffffffffffff; wanted those of"),
         ("data", "e" * 64, "got demonstrations with the SHA-256"),
     ],
 )
 def test_an_episode_of_something_else_is_refused(other_row, field: str, wrong: str, words: str):
     run, row = other_row(**{field: wrong})
-    with pytest.raises(ReplayError, match=words):
+    with pytest.raises(UserError, match=words):
         Replay(run).rerun(row)

@@ -127,6 +127,9 @@ class NpzReader:
 
     def right(self, value: list[Demonstration]) -> bool:
         with np.load(self.path, allow_pickle=False) as arrays:
+            if "episode_lengths" not in arrays.files:  # one episode
+                (one,) = value
+                return np.array_equal(one.observations, arrays["observations"][:, :3].astype(np.float32))
             ends = np.cumsum(arrays["episode_lengths"])
             observations = np.split(arrays["observations"][:, :3].astype(np.float32), ends)[:-1]
             actions = np.split(arrays["actions"].astype(np.float32), ends)[:-1]

@@ -45,6 +45,7 @@ def make_run(
         best: score of an episode, which counts where it is more than one.
         metrics: of each iteration from the first.
     """
+    folder.mkdir(parents=True, exist_ok=True)
     config = ExperimentConfig.model_validate({"seed": seed, **settings})
     manifest = Manifest(
         iteration=len(metrics), loss=None, config=config, shapes={"one": (1,)}, data={}, versions={}, mlflow_run_id=None

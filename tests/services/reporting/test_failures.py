@@ -8,14 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dmil_core.errors import UserError
 from dmil_core.trajectories import Rollout
 from services import report
 from services.cli.colours import COLOURS
 from services.distributed.runner import LocalRunner
 from services.evaluation.results import EpisodeResult, write_rows
+from services.evaluation.summary import summarise
 from services.experiments.finished_run import FinishedRun
 from services.experiments.replay import ReplayedEpisode
 from services.reporting.drawing import Picture
+from services.reporting.end_of_run import write_report
 from services.reporting.failures import FAILED, SOLVED, draw_episodes, failures_of_run, worst_tasks
 from services.reporting.page import Commands, DataTable, Prose, Section
 from services.rollouts.recording import Recording
@@ -141,17 +144,16 @@ def test_a_policy_that_diverged_at_once_has_no_line_but_a_row(with_rows):
     assert "came out otherwise than in the run" in prose(section)[1]
 
 
-def test_what_cannot_be_run_again_is_reported_on_the_page(with_rows):
-    section = failures_of_run(with_rows(lambda row: True, checkpoint="f" * 64, success=False))
-    (message,) = prose(section)
-    assert message.startswith("Their episodes cannot be run again here: ")
-    assert "the episodes are of ffffffffffff" in message
+def test_rows_of_another_checkpoint_are_refused(with_rows):
+    with pytest.raises(UserError, match="got rows of ffffffffffff; wanted those of"):
+        failures_of_run(with_rows(lambda row: True, checkpoint="f" * 64, success=False))
 
 
 def test_a_suite_without_a_measure_has_its_episodes_and_no_curve(trained):
     run = trained("run", evaluation={"episodes": 4, "support_draws": 2, "shots": (1,)})
     runner = LocalRunner(run.experiment.suite)
-    run.experiment.evaluate(runner, run.demonstrations, run.checkpoint, run.folder, ["blue-green-red"])
+    found = run.experiment.evaluate(runner, run.demonstrations, run.checkpoint, run.folder, ["blue-green-red"])
+    write_report(summarise(found, seconds={}, folder=run.folder), run.folder)
     section = failures_of_run(run)
     assert not [part for part in section.parts if isinstance(part, Picture)]
     assert "The suite does not measure how far an episode has come" in prose(section)[1]
