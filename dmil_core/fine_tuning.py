@@ -1,6 +1,5 @@
 """Fine-tuning by Adam on batches of states, its rate falling along a cosine: many steps on many displaced copies."""
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -9,12 +8,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dmil_core.losses import Steps, squared_errors
-from dmil_core.networks import Adam, Layer, Network, descend
+from dmil_core.networks import Adam, Layer, Network, cosine_rate, descend
 
 BATCH = 128
 """States in a step."""
-LAST = 0.01
-"""The last step's rate, as a part of the first one's."""
 Optimiser: TypeAlias = Literal["sgd", "adam"]
 
 
@@ -37,8 +34,7 @@ def on_batches(networks: Sequence[Network], loss: Callable[[Steps], Tensor], ste
     adam = Adam([tensor for network in networks for layer in network for tensor in layer], tuning.learning_rate)
     generator = torch.Generator().manual_seed(0)
     for step in range(tuning.steps):
-        along = 0.5 * (1 + math.cos(math.pi * step / tuning.steps))
-        adam.learning_rate = tuning.learning_rate * (LAST + (1 - LAST) * along)
+        adam.learning_rate = cosine_rate(tuning.learning_rate, step / tuning.steps)
         drawn: Int[Tensor, " batch"] = torch.randint(len(steps.states), (BATCH,), generator=generator)
         descend(adam, loss(Steps(steps.states[drawn], steps.actions[drawn], torch.ones(BATCH, dtype=torch.int64))))
 

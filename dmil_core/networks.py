@@ -5,6 +5,7 @@ networks along the first axis of every tensor; `bank` and `network` give views o
 """
 
 import itertools
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
@@ -152,6 +153,16 @@ class Adam:
             parameters, gradients, first, second, [], steps, fused=True, decoupled_weight_decay=True, amsgrad=False,
             beta1=0.9, beta2=0.999, lr=self.learning_rate, weight_decay=self._weight_decay, eps=1e-8, maximize=False,
         )  # fmt: skip
+
+
+LAST_RATE = 0.01
+"""The last learning rate of a cosine, as a part of the first."""
+
+
+def cosine_rate(first: float, done: float) -> float:
+    """Return the learning rate that falls from `first` along a cosine, when the part `done` of all steps is done."""
+    along = 0.5 * (1 + math.cos(math.pi * done))
+    return first * (LAST_RATE + (1 - LAST_RATE) * along)
 
 
 def descend(optimiser: Adam | torch.optim.Optimizer, loss: Float[Tensor, ""]) -> None:

@@ -1,6 +1,5 @@
 """The outer loop of Algorithm 1: which task sits in which slot, a group's gradient, and the step of Adam."""
 
-import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
@@ -14,16 +13,12 @@ from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import as_work_error
 from dmil_core.methods.base import MetaLearner, OnlineMetaLearner, Policy, TaskGradient
-from dmil_core.networks import Adam, Parameters
+from dmil_core.networks import Adam, Parameters, cosine_rate
 from dmil_core.seeding import named_rng, named_seed
 from dmil_core.trajectories import Rollout
 
 BLOCKS_PER_WORKER = 4
 """Blocks that each worker should find at least, so that a slow one takes fewer and the others do not wait."""
-
-
-LAST_RATE = 0.01
-"""The last learning rate of a cosine schedule, as a part of the first."""
 
 
 CollectRollouts: TypeAlias = Callable[[Policy, str, int, int], Sequence[Rollout]]
@@ -204,8 +199,7 @@ class OuterStep:
         training, done = self._training, int(self._adam.steps[0])
         if training.schedule == "constant":
             return training.learning_rate
-        along = 0.5 * (1 + math.cos(math.pi * min(done / training.iterations, 1)))
-        return training.learning_rate * (LAST_RATE + (1 - LAST_RATE) * along)
+        return cosine_rate(training.learning_rate, min(done / training.iterations, 1.0))
 
     def skip(self) -> None:
         """Count an iteration without a step of Adam; parameters and moments stay."""

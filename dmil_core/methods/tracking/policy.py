@@ -14,6 +14,7 @@ from dmil_core.points import Points, position, present
 NEAR = 2.0
 """In units of the hand's reach in a step: so near, the path's next place is next."""
 GAIN = 0.1
+"""Action for each reach of the hand that it is away from the path's place."""
 PATIENCE = 15
 """Steps after which the next place is next anyway."""
 MICRO = 1e-6
