@@ -23,6 +23,7 @@ from dmil_core.methods.base import Policy
 from dmil_core.methods.registry import method_type
 from dmil_core.policy_tensors import tensors_of, with_tensors
 from dmil_core.recorded import Interface, numbers
+from dmil_core.settings import AnyCount, Positive
 
 POLICY, SEAL = "policy.json", "policy.sha256"
 TENSORS, DEMONSTRATIONS = "policy.safetensors", "demonstrations.safetensors"
@@ -39,10 +40,10 @@ class Source(BaseModel):
 
     model: Manifest
     """Of the checkpoint that was adapted."""
-    fine_tuning_steps: Annotated[int, Field(ge=0, lt=2**63)]
-    learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    fine_tuning_steps: AnyCount
+    learning_rate: Positive
     optimiser: Optimiser = "sgd"
-    displaced: Annotated[int, Field(ge=0)] = 0
+    displaced: AnyCount = 0
     demonstrations: Annotated[tuple[tuple[str, str], ...], Field(min_length=1)]
     """Task and id of each demonstration that it was adapted to."""
     files: dict[str, str] = {}

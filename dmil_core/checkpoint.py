@@ -59,7 +59,8 @@ ADDED = {
 }
 """Settings that version 0.1 did not have: where they have their defaults, a digest is as it was without them."""
 
-Side = Annotated[int, Field(ge=1, le=MOST_TENSORS)]
+Side = Annotated[int, Field(ge=1, le=MOST_TENSORS, strict=True)]
+Finite = Annotated[FiniteFloat, Field(strict=True)]
 Shape = Annotated[tuple[Side, ...], Field(min_length=1, max_length=8)]
 
 
@@ -72,8 +73,8 @@ class Range(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    low: Annotated[tuple[FiniteFloat, ...], Field(min_length=1)]
-    high: Annotated[tuple[FiniteFloat, ...], Field(min_length=1)]
+    low: Annotated[tuple[Finite, ...], Field(min_length=1)]
+    high: Annotated[tuple[Finite, ...], Field(min_length=1)]
 
     @model_validator(mode="after")
     def _goes_upwards(self) -> "Range":
@@ -96,15 +97,15 @@ class Manifest(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    iteration: Annotated[int, Field(ge=0, lt=2**63)]
+    iteration: Annotated[int, Field(ge=0, lt=2**63, strict=True)]
     """Outer steps done; the one unit of progress everywhere."""
-    loss: float | None
+    loss: Annotated[float, Field(strict=True)] | None
     """Mean loss after adaptation since the checkpoint before, by which the best is chosen."""
     config: ExperimentConfig
     shapes: dict[str, Shape]
     """Names and shapes of the parameters, in the order in which they are laid out flat; none of a method that learns
     nothing."""
-    environment_steps: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    environment_steps: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
     """Steps that an online method took in the environments of meta-training tasks."""
     actions: Range | None = None
     """The bounds of the action space; none in checkpoints of version 0.1."""

@@ -11,6 +11,7 @@ from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.registry import config_type
 from dmil_core.points import Points
 from dmil_core.settings import (
+    AnyCount,
     ContextConfig,
     Count,
     Flag,
@@ -72,7 +73,7 @@ class DemonstrationConfig(Settings):
     """Standard deviation of the noise added to the action that the expert's environment executes."""
     labels: Literal["clean", "noisy"] = "clean"
     """Action that is stored: clean is the expert's own, noisy the executed one."""
-    trailing_steps: Annotated[int, Field(ge=0, le=10**9, strict=True)] = 10
+    trailing_steps: AnyCount = 10
     """Steps recorded after the task is solved."""
     longest: Size | Literal["reference"] | None = None
     """Steps after which an attempt fails; reference: the limits of the authors' released code, 100 for most tasks;
@@ -97,7 +98,7 @@ class DemonstrationConfig(Settings):
 class TrainingConfig(Settings):
     """The outer loop."""
 
-    iterations: Annotated[int, Field(ge=0, le=10**9, strict=True)] = 2000
+    iterations: AnyCount = 2000
     """Outer steps."""
     tasks_per_iteration: Size = 10
     """Tasks in a batch, sampled without replacement where there are enough."""
@@ -131,7 +132,7 @@ class EvaluationConfig(Settings):
     """Episodes of each task for each size (Table 4)."""
     support_draws: Size = 4
     """Disjoint support sets of each task, over which its episodes are spread."""
-    fine_tuning_steps: Annotated[int, Field(ge=0, le=10**9, strict=True)] = 50
+    fine_tuning_steps: AnyCount = 50
     """Steps of adaptation to the support set (E.4)."""
     learning_rate: Positive = 1e-2
     """Learning rate of adaptation (E.4)."""

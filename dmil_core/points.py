@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from dmil_core.errors import UserError
 from dmil_core.settings import Positive, Settings
 
-Index = Annotated[int, Field(ge=0, lt=10_000)]
+Index = Annotated[int, Field(ge=0, lt=10_000, strict=True)]
 Axes = Annotated[tuple[Index, ...], Field(min_length=1, max_length=100)]
 
 
@@ -33,7 +33,7 @@ class Points(Settings):
     """Orientation of the object, as a quaternion or the like."""
     second_orientation: tuple[Index, ...] = ()
     """Orientation of the second object."""
-    previous: Annotated[int, Field(ge=1, lt=10_000)] | None = None
+    previous: Annotated[int, Field(ge=1, lt=10_000, strict=True)] | None = None
     """How much further on an observation has the same number of the step before, for hand, object and gripper; none if
     it has not."""
     reach: Positive = 0.01

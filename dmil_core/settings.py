@@ -8,6 +8,8 @@ from pydantic_core import PydanticCustomError
 
 # strict: a number as text and true for a number are refused wherever settings come from, in YAML and in JSON alike.
 Count = Annotated[int, Field(ge=1, le=10**9, strict=True)]
+AnyCount = Annotated[int, Field(ge=0, le=10**9, strict=True)]
+"""A count that may be 0."""
 Size = Annotated[int, Field(ge=1, le=10_000, strict=True)]
 """A count of what is held in memory together."""
 Flag = Annotated[bool, Field(strict=True)]

@@ -2,13 +2,18 @@
 
 import json
 import unicodedata
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import BaseModel
 
+from dmil_core.adapted_policy import Source
+from dmil_core.checkpoint import Manifest
 from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import UserError
+from dmil_core.methods.registry import OURS, config_type
 from services import evaluate, inspect_demos, meta_train
 from services.cli.arguments import peek
 from services.cli.composition import EARLY, config_from
@@ -41,6 +46,9 @@ def config_of(tmp_path: Path, text: str) -> ExperimentConfig:
         ("suite: {goal_visible: 1}\n", "goal_visible: got 1"),
         ("suite: {goal_visible: no}\n", "goal_visible: got 'no'"),
         ("training: {iterations: 3.0}\n", "training.iterations: got 3.0"),
+        ('method: {labels_until: "5"}\n', "labels_until: got '5'"),
+        ('suite: {points: {size: "4", hand: [0, 1]}}\n', "suite.points.size: got '4'"),
+        ("suite: {points: {size: 4, hand: [false, 1]}}\n", "suite.points.hand.0: got False"),
         ("<<: {seed: 3}\n", "unknown key <<"),
         ("evaluation: {shots: [1, 3, 1]}\n", "evaluation.shots: got [1, 3, 1]; wanted each once"),
         ("suite: {test_tasks: [push, push]}\n", "suite.test_tasks: got ['push', 'push']; wanted each once"),
@@ -67,6 +75,27 @@ def test_json_refuses_what_yaml_does(seed: object):
     settings = json.dumps({"seed": seed})
     with pytest.raises(ValueError, match="seed"):
         ExperimentConfig.model_validate_json(settings)
+
+
+def lenient(schema: object, place: str) -> Iterator[str]:
+    """Yield the places of a schema of pydantic's where a number may stand as text, or true for a number."""
+    if isinstance(schema, Mapping):
+        if schema.get("type") in ("int", "float", "bool") and not schema.get("strict"):
+            yield place
+        for key, value in schema.items():
+            yield from lenient(value, f"{place}.{key}")
+    elif isinstance(schema, list | tuple):
+        for value in schema:
+            yield from lenient(value, place)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [ExperimentConfig, Manifest, Source, *(config_type(name) for name in OURS)],
+    ids=lambda model: model.__name__,
+)
+def test_no_number_is_taken_as_text(model: type[BaseModel]):
+    assert not list(lenient(model.__pydantic_core_schema__, ""))
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,12 @@
 """The settings of Dual Meta Imitation Learning, each with the place in the paper that it comes from."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
-
-from pydantic import Field
+from typing import Any, ClassVar, Literal
 
 from dmil_core.settings import (
     QUICK_NETWORK,
     SMOKE_NETWORK,
+    AnyCount,
     ContextConfig,
     HierarchicalConfig,
     NetworkConfig,
@@ -43,7 +42,7 @@ class DmilConfig(HierarchicalConfig, NetworkConfig, WindowConfig, ContextConfig)
     balance: Literal["none", "sinkhorn"] = "none"
     """Labels in meta-training: none gives each state to the sub-skill that fits best (equation 3); sinkhorn also gives
     each sub-skill about as many of a set's states, so that none is left without any."""
-    labels_until: Annotated[int, Field(ge=0, le=10**9)] = 0
+    labels_until: AnyCount = 0
     """In so many first iterations of meta-training a sub-skill learns where the labels say, not where the high level
     has chosen it: one that is never chosen learns too."""
     order: Literal["first", "second"] = "second"

@@ -8,6 +8,7 @@ from pydantic import Field
 from dmil_core.settings import (
     QUICK_NETWORK,
     SMOKE_NETWORK,
+    AnyCount,
     Count,
     HierarchicalConfig,
     NetworkConfig,
@@ -17,8 +18,6 @@ from dmil_core.settings import (
     Size,
 )
 
-Iterations = Annotated[int, Field(ge=0, le=10**9, strict=True)]
-
 
 class OptionConfig(HierarchicalConfig, NetworkConfig):
     """Base of both: the option model and its maximum likelihood."""
@@ -27,7 +26,7 @@ class OptionConfig(HierarchicalConfig, NetworkConfig):
     """Lower bound of log σ of an option's actions; the upper bound is 0."""
     trajectories: Size = 16
     """Whole demonstrations that a slot draws from its task (Table 9)."""
-    likelihood_iterations: Iterations = 250
+    likelihood_iterations: AnyCount = 250
     """Iterations of maximum likelihood, before those of hard EM."""
 
 
@@ -55,9 +54,9 @@ class OptionGailConfig(OptionConfig):
 
     name: Literal["option-gail"] = "option-gail"
     """The method."""
-    likelihood_iterations: Iterations = 60
+    likelihood_iterations: AnyCount = 60
     """Offline iterations of maximum likelihood; the remaining ones are of hard EM."""
-    offline_iterations: Iterations = 400
+    offline_iterations: AnyCount = 400
     """Offline iterations, before the adversarial ones."""
     offline_steps: Count = 10
     """Steps of Adam that a slot takes in an offline iteration, each on its whole batch."""
