@@ -5,7 +5,7 @@ INSTALLED := .venv/installed
 PROCESSES := 3
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train cluster cluster-stop test test-all missing tools mutants check-deploy audit clean
+.PHONY: help setup train cluster cluster-stop docs test test-all missing tools mutants check-deploy audit clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):[^#]*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -34,6 +34,10 @@ cluster: setup ## start a Ray head and an MLflow server on this machine, for Ray
 cluster-stop: setup ## stop these two
 	@$(BIN)/python -m services.local_cluster stop
 
+docs: setup ## build the documentation's site into build/site; a broken link or a warning is an error
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
 define CHECK
 $(BIN)/ruff check
 $(BIN)/ruff format --check
@@ -56,7 +60,7 @@ MISSING = $(strip \
 	$(if $(shell command -v chromium),,chromium) \
 	$(if $(shell command -v promtool),,prometheus) \
 	$(if $(wildcard /usr/lib/postgresql/*/bin/postgres),,postgresql))
-INSTALL_CHECKERS = $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,deploy]'
+INSTALL_CHECKERS = $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,deploy,docs]'
 NEEDS_KUBECTL = command -v kubectl >/dev/null || \
 	{ echo "found no kubectl, 1.27 or newer, to render overlays: https://kubernetes.io/docs/tasks/tools"; exit 1; }
 
