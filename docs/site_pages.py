@@ -29,6 +29,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
     """Turn links to the root into links of the site, and equations into MathML, which browsers show by themselves."""
     for name, place in ROOT_PAGES.items():
         markdown = markdown.replace(f"](../{name}", f"]({place}")
+    markdown = markdown.replace(f"]({NOTEBOOK}.ipynb)", f"]({NOTEBOOK}.md)")
     return EQUATION.sub(lambda found: f"<div>{convert(found[1], display='block')}</div>", markdown)
 
 
@@ -44,8 +45,8 @@ def _parts(cell: dict[str, Any]) -> list[str]:
     parts = [f"```python\n{source}\n```"]
     for output in cell["outputs"]:
         data = output.get("data", {})
-        if "image/png" in data:
-            parts.append(f"![What the code above draws](data:image/png;base64,{data['image/png'].strip()})")
+        if drawn := [f"data:{kind};base64,{data[kind].strip()}" for kind in data if kind.startswith("image/")]:
+            parts.append(f"![What the code above draws]({drawn[0]})")
         elif shown := "".join(output.get("text", data.get("text/plain", ""))):
             parts.append(f"```text\n{shown.rstrip()}\n```")
     return parts
