@@ -100,7 +100,7 @@ def _carry_out(args: Arguments, folder: Path, experiment: Experiment) -> None:
     checkpoints = Checkpoints(folder / "checkpoints", config.training.checkpoints_kept)
     checkpoint = checkpoints.newest() if checkpoints.all() else None
     if checkpoint is not None:
-        check_settings(checkpoint, config, folder / MARK)
+        check_settings(checkpoint, experiment.config, folder / MARK)
     clock = Clock()
     write_file(folder, MARK, config.model_dump_json(indent=1) + "\n")
     tracker = Tracker(folder, f"dmil-{config.suite.name}")

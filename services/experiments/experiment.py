@@ -37,7 +37,7 @@ from services.tracking.tracker import Tracker
 OnNonfinite = Literal["stop", "skip"]
 MOST_FAULTS = 0.01
 """Of the episodes of an evaluation, those that a simulator may spoil."""
-CHANGEABLE = {"evaluation": True, "training": {"iterations", "checkpoint_every", "checkpoints_kept"}}
+CHANGEABLE: dict[str, Any] = {"evaluation": True, "training": {"iterations", "checkpoint_every", "checkpoints_kept"}}
 """Settings that a run may change when it goes on, without becoming another."""
 
 
@@ -306,8 +306,13 @@ def check_settings(resume: Checkpoint, config: ExperimentConfig, origin: Path) -
 
 
 def changed_settings(before: ExperimentConfig, now: ExperimentConfig) -> dict[str, tuple[Any, Any]]:
-    """Return the settings that differ and make another run, by dotted key: the one before, and the one now."""
-    old, new = (dict(_flat(config.model_dump(exclude=CHANGEABLE), "")) for config in (before, now))
+    """Return the settings that differ and make another run, by dotted key: the one before, and the one now.
+
+    Points are compared where both have them: a suite's own are filled in when a method, or an evaluation, uses them.
+    """
+    both = before.suite.points is not None and now.suite.points is not None
+    without = CHANGEABLE if both else CHANGEABLE | {"suite": {"points"}}
+    old, new = (dict(_flat(config.model_dump(exclude=without), "")) for config in (before, now))
     return {key: (old.get(key), new.get(key)) for key in old | new if old.get(key) != new.get(key)}
 
 

@@ -122,8 +122,9 @@ def test_episodes_start_from_goals_that_no_demonstration_holds(workplace: Path, 
 
 
 def test_going_on_ends_with_the_same_bits(workplace: Path, train, mlflow_file: str):
-    undisturbed = train("whole", "--training.iterations", "7")
-    half = train("parts", "--training.iterations", "4")
+    seeing = ("--method.features", "relative", "--method.context", "path")
+    undisturbed = train("whole", *seeing, "--training.iterations", "7")
+    half = train("parts", *seeing, "--training.iterations", "4")
     resumed = train("parts", "--training.iterations", "7", resume=True)
     assert half.manifest.iteration == 4
     assert same(resumed, undisturbed)
