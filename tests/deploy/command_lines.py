@@ -5,17 +5,20 @@ import importlib.util
 import io
 import re
 import shlex
+import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from importlib import import_module
-from typing import Any
+from pathlib import Path
+from typing import Any, NoReturn
 
 import click
+import pytest
 
 from dmil_core.errors import UserError
-from services import meta_train, tune_sweep
-from services.cli.arguments import parse, peek
-from services.cli.composition import EARLY, defaults_from
+from services import report, tune_sweep
+from services.cli.arguments import PROGRAMS as PROGRAMS_OF_DMIL
+from services.cli.arguments import parse
 from tests.deploy.manifests import DEPLOY, ask
 
 PROGRAMS = {"ray", "mlflow", "python", "weed", "prometheus", "pg_isready", "wget"}
@@ -28,9 +31,8 @@ IN_CONTAINERS_ONLY = {"weed", "pg_isready", "wget"}
 def refused(arguments: Sequence[str]) -> str | None:
     """Return what is wrong with a command line, or None."""
     match arguments:
-        case ["ray", "start" | "stop" | "health-check" as name, *flags]:
-            scripts = _imported("ray.scripts.scripts")
-            return _refused_by_click(getattr(scripts, name.replace("-", "")), flags)
+        case ["ray", "start" | "stop" | "health-check" | "up" | "dashboard" | "rsync-down" as name, *flags]:
+            return _refused_by_click(_imported("ray.scripts.scripts").cli.commands[name], flags)
         case ["ray", "job", "submit", *flags]:
             own = flags[: flags.index("--")] if "--" in flags else flags
             submit = _imported("ray.dashboard.modules.job.cli").submit
@@ -39,6 +41,11 @@ def refused(arguments: Sequence[str]) -> str | None:
             return _refused_by_click(_imported("mlflow.cli").server, flags)
         case ["python", "-m", module, *flags]:
             return _refused_by_module(module, flags)
+        case ["dmil", name, *flags] if name in PROGRAMS_OF_DMIL:
+            return _refused_by_module(f"services.{name.replace('-', '_')}", flags)
+        case ["make", target]:
+            makefile = (DEPLOY.parent / "Makefile").read_text("utf-8")
+            return None if re.search(rf"^{target}\b.*:", makefile, re.MULTILINE) else f"{target}: no target of make"
         case ["python", "-c", code]:
             compile(code, "-c", "exec")
             return None
@@ -70,26 +77,41 @@ def _refused_by_click(command: click.Command, flags: Sequence[str]) -> str | Non
     return None
 
 
+class _ReadError(BaseException):
+    """A program has read its arguments, and goes no further."""
+
+
+def _read_only(*arguments: Any) -> NoReturn:
+    raise _ReadError(parse(*arguments))
+
+
 def _refused_by_module(module: str, flags: Sequence[str]) -> str | None:
+    """Let a program read its arguments, and stop it there."""
     if importlib.util.find_spec(module) is None:
         return f"{module}: there is no such module"
+    if module == "pytest":
+        return None
     said = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            match module:
-                case "services.meta_train":
-                    defaults: Any = meta_train.Arguments(defaults_from(peek(flags, **EARLY)))
-                    parse(meta_train.Arguments, "", flags, defaults)
-                case "services.tune_sweep":
-                    given = parse(tune_sweep.Arguments, "", flags, tune_sweep.Arguments())
-                    if given.sweep is not None and not (tune_sweep.CONFIGS / f"{given.sweep}.yaml").is_file():
-                        return f"{given.sweep}: there is no such sweep in tune_configs"
-                case _:
-                    return f"{module}: the checks do not know how it reads its arguments; teach them"
-    except UserError as error:
-        return str(error)
-    except SystemExit as error:
-        return None if error.code == 0 else said.getvalue()
+    for each in report.KINDS.values():
+        import_module(each)  # before they are patched
+    program = import_module("services.tracking.__main__" if module == "services.tracking" else module)
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        for loaded in [each for name, each in sys.modules.items() if name.startswith(("services.", "benchmarks."))]:
+            if getattr(loaded, "parse", None) is parse:
+                patch.setattr(loaded, "parse", _read_only)
+        try:
+            if module.startswith("benchmarks."):
+                _read_only(program.Arguments, "", flags, program.Arguments())
+            program.run(flags)
+        except _ReadError as read:
+            sweep = read.args[0].sweep if isinstance(read.args[0], tune_sweep.Arguments) else None
+            if sweep is None or (tune_sweep.CONFIGS / f"{Path(sweep).stem}.yaml").is_file():
+                return None
+            return f"{sweep}: there is no such sweep in tune_configs"
+        except UserError as error:
+            return str(error)
+        except SystemExit as error:
+            return None if error.code == 0 else said.getvalue()
     return None
 
 

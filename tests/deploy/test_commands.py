@@ -1,4 +1,4 @@
-"""Every command line in `deploy/`, and in the page about it, is one that its program takes."""
+"""Every command line in `deploy/` is one that its program takes."""
 
 import json
 import re
@@ -23,8 +23,6 @@ from tests.deploy.manifests import (
 )  # fmt: skip
 
 pytestmark = pytest.mark.thorough
-
-PAGES = ("docs/deploy.md", "docs/operations.md")
 
 
 def of_images() -> Iterator[tuple[str, list[str]]]:
@@ -63,16 +61,7 @@ def of_launchers() -> Iterator[tuple[str, list[str]]]:
                         yield from ((path.name, command) for command in commands(line) if command[0] != "python")
 
 
-def of_pages() -> Iterator[tuple[str, list[str]]]:
-    for page in PAGES:
-        for block in re.findall(r"```(?:bash|sh)\n(.*?)```", (PROJECT / page).read_text("utf-8"), re.DOTALL):
-            for line in block.replace("\\\n", "").splitlines():
-                for command in commands(line.partition("#")[0]):
-                    if command[:3] == ["ray", "job", "submit"] or command[:2] == ["python", "-m"]:
-                        yield page, command
-
-
-@pytest.mark.parametrize("source", [of_images, of_services, of_pods, of_launchers, of_pages])
+@pytest.mark.parametrize("source", [of_images, of_services, of_pods, of_launchers])
 def test_every_command_line_is_taken(source):
     found = list(source())
     assert len(found) > 1
@@ -92,7 +81,6 @@ def test_every_command_line_is_taken(source):
         ("python -m services.meta_train --preset ml10-quick --iterations 3", "--iterations"),
         ("python -m services.tune_sweep sub-skills", "sub-skills"),
         ("python -m services.tune_sweep sub_skills --preset large", "large"),
-        ("python -m services.distributed.cluster", "teach them"),
         ("python /usr/local/bin/make_buckets.py mlflow", "make_buckets.py"),
         ("prometheus --config=x", "--config"),
         ("minio server /data", "nothing here knows"),

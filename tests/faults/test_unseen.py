@@ -1,8 +1,5 @@
 """Faults that were put into the code once, and that no test noticed: each has a test that sees it."""
 
-import contextlib
-import functools
-import io
 import os
 import re
 import shlex
@@ -58,27 +55,6 @@ def lines_of(page: str) -> Iterator[list[str]]:
                 yield [words[1].replace("-", "_"), *words[2:]]
             elif words[:2] == ["python", "-m"] and words[2].startswith("services."):
                 yield [words[2].removeprefix("services."), *words[3:]]
-
-
-@functools.cache
-def help_of(program: str, subcommand: tuple[str, ...]) -> str:
-    module = import_module(f"services.{program}.__main__" if program == "tracking" else f"services.{program}")
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said), pytest.raises(SystemExit) as end:
-        module.run([*subcommand, "--help"])
-    assert not end.value.code, said.getvalue()
-    return said.getvalue()
-
-
-@pytest.mark.parametrize("page", ["README.md", "docs/data.md", "docs/your-own-task.md", "docs/sweeps.md"])
-def test_every_flag_in_the_pages_is_one(page: str, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
-    lines = list(lines_of(page))
-    assert lines
-    for program, *arguments in lines:
-        subcommand = tuple(arguments[:1]) if program in ("report", "collect_demos") and arguments[0][0] != "-" else ()
-        for flag in (word.partition("=")[0] for word in arguments if word.startswith("--")):
-            assert flag == "--help" or flag in help_of(program, subcommand), f"{page}: {program} {flag}"
 
 
 @pytest.mark.thorough
