@@ -4,7 +4,6 @@ Jobs run in the folder that it was started in, and log to that MLflow server. Th
 """
 
 import os
-import secrets
 import shutil
 import socket
 import stat
@@ -28,7 +27,7 @@ from dmil_core.files import append_to, read_file, write_file
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.distributed.node_info import usable_cpus
-from services.storage.private import bypass_proxies, make_private_folder
+from services.storage.private import bypass_proxies, make_private_folder, private_token
 from services.tracking.server import LOGINS, server_command, server_environment
 
 SECONDS_TO_START = 120.0
@@ -239,16 +238,7 @@ def _token(folder: Path) -> Path:
         UserError: if the folder or the token is somebody else's, or the environment has another token, which Ray's
             programs would use.
     """
-    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    path = folder / "token"
-    if exposed := _exposure(folder, 0o022) or _exposure(path, 0o077):
-        console.print(f"{exposed}, open to other users; it is closed, and a new token made", soft_wrap=True)
-        folder.chmod(0o700)
-        path.unlink(missing_ok=True)
-    if not path.exists() or path.stat().st_size == 0:  # empty: a start was killed
-        path.unlink(missing_ok=True)
-        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-            file.write(secrets.token_hex(32))
+    path = private_token(folder, lambda exposed: console.print(exposed, soft_wrap=True))
     if os.environ.get("RAY_AUTH_TOKEN", (token := read_file(folder, path.name, MOST_BYTES).decode())) != token:
         raise UserError(
             f"RAY_AUTH_TOKEN: got another token than that in {path}, perhaps of an earlier cluster; wanted none, or "
@@ -259,20 +249,6 @@ def _token(folder: Path) -> Path:
             f"RAY_AUTH_TOKEN_PATH: got {os.environ['RAY_AUTH_TOKEN_PATH']}; wanted {path}, or none: unset it"
         )
     return path
-
-
-def _exposure(path: Path, closed: int) -> str | None:
-    """Return how others can get at a path by its mode bits `closed`, or None.
-
-    Raises:
-        UserError: if it is a link, or somebody else's.
-    """
-    if not os.path.lexists(path):
-        return None
-    found = path.lstat()
-    if stat.S_ISLNK(found.st_mode) or found.st_uid != os.geteuid():
-        raise UserError(f"{path}: got a link, or another user's; wanted your own; remove it, or give another --folder")
-    return f"{path}: got mode {stat.S_IMODE(found.st_mode):04o}" if found.st_mode & closed else None
 
 
 def _free_port() -> int:

@@ -163,7 +163,7 @@ BY_HAND = {
     "services/doctor.py": {"folder.rmdir"},  # one that it made, if it is empty
     "services/experiments/champions.py": {"folder.mkdir"},  # for MLflow to download into
     "services/reporting/film.py": {"made.read_bytes"},  # out of a temporary folder of its own
-    "services/storage/private.py": {"shutil.rmtree", "tempfile.mkdtemp"},
+    "services/storage/private.py": {"shutil.rmtree", "tempfile.mkdtemp", "folder.mkdir", "path.unlink", "os.open"},
     "services/storage/remote.py": {"self._files.makedirs", "self._files.open"},
     "services/storage/run_folders.py": {"folder.mkdir"},  # takes a name
 }

@@ -36,6 +36,7 @@ PROGRAMS = {
     "meta-train": "collect demonstrations, meta-train, evaluate",
     "collect-demos": "let the scripted experts make demonstrations",
     "adapt": "adapt a model to demonstrations of your own, and save the policy",
+    "serve": "serve a model over HTTP: demonstrations in, actions out",
     "evaluate": "adapt a checkpoint to each task and measure its success rates",
     "tune-sweep": "run an ablation or a search on Ray Tune",
     "doctor": "check a machine or a cluster before a long run",

@@ -77,7 +77,22 @@ def read_arrays(path: Path, obs_dim: int | None = None) -> list[tuple[np.ndarray
         DemonstrationError: names the file, and the array that cannot be used.
     """
     try:
-        arrays = _read_arrays(read_file(*named(path), MOST_ARCHIVE))
+        return arrays_in(read_file(*named(path), MOST_ARCHIVE), obs_dim)
+    except (OSError, DemonstrationError) as error:
+        got = str(error) if isinstance(error, DemonstrationError) else _unreadable(error)
+        raise DemonstrationError(f"{path}: {got}") from error
+
+
+def arrays_in(
+    content: bytes, obs_dim: int | None = None, most: int = MOST_ARRAYS
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return observations and actions of each demonstration in the content of a file, whose arrays have `most` bytes.
+
+    Raises:
+        DemonstrationError: names the array that cannot be used.
+    """
+    try:
+        arrays = _read_arrays(content, most)
         episodes = episodes_in(arrays["observations"], arrays["actions"], arrays.get("episode_lengths"))
         columns = episodes[0][0].shape[1]
         if obs_dim is not None and not 0 < obs_dim <= columns:
@@ -87,14 +102,18 @@ def read_arrays(path: Path, obs_dim: int | None = None) -> list[tuple[np.ndarray
                 (np.ascontiguousarray(observations[:, :obs_dim], np.float32), np.ascontiguousarray(actions, np.float32))
                 for observations, actions in episodes
             ]
+    except DemonstrationError:
+        raise
     # What zipfile and numpy raise of damaged files; NotImplementedError and RuntimeError for what they do not read.
     except (
         OSError, ValueError, TypeError, EOFError, SyntaxError, MemoryError, RuntimeError,
         zipfile.BadZipFile, zlib.error, tokenize.TokenError,
     ) as error:  # fmt: skip
-        known = isinstance(error, DemonstrationError)
-        got = str(error) if known else f"got {type(error).__name__}, {error}; wanted an npz file as numpy writes it"
-        raise DemonstrationError(f"{path}: {got}") from error
+        raise DemonstrationError(_unreadable(error)) from error
+
+
+def _unreadable(error: Exception) -> str:
+    return f"got {type(error).__name__}, {error}; wanted an npz file as numpy writes it"
 
 
 def episodes_in(
@@ -153,11 +172,11 @@ def _check_lengths(lengths: np.ndarray, observations: int, actions: int) -> None
         )
 
 
-def _read_arrays(content: bytes) -> dict[str, np.ndarray]:
+def _read_arrays(content: bytes, most: int) -> dict[str, np.ndarray]:
     _check_end(content)
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         members = archive.infolist()
-        _check_members(members)
+        _check_members(members, most)
         return {name: _read_array(archive, member, name) for member in members for name in [_name(member)]}
 
 
@@ -171,7 +190,7 @@ def _check_end(content: bytes) -> None:
         )
 
 
-def _check_members(members: list[zipfile.ZipInfo]) -> None:
+def _check_members(members: list[zipfile.ZipInfo], most: int) -> None:
     names = [member.filename for member in members]
     wanted = {f"{name}.npy" for name in FORMS}
     if len(set(names)) != len(names) or not {f"{name}.npy" for name in FORMS.keys() - OPTIONAL} <= set(names) <= wanted:
@@ -189,8 +208,8 @@ def _check_members(members: list[zipfile.ZipInfo]) -> None:
                 f"{_name(member)}: got {member.file_size} bytes packed into {member.compress_size}; wanted at most "
                 f"{MOST_PACKED} for one"
             )
-    if (total := sum(member.file_size for member in members)) > MOST_ARRAYS:
-        raise DemonstrationError(f"got arrays of {total} bytes; wanted at most {MOST_ARRAYS}; split the file")
+    if (total := sum(member.file_size for member in members)) > most:
+        raise DemonstrationError(f"got arrays of {total} bytes; wanted at most {most}; split the file")
 
 
 def _name(member: zipfile.ZipInfo) -> str:

@@ -1,9 +1,11 @@
-"""What the processes of one user share on a machine with others: a folder that nobody else enters, and no proxy."""
+"""What the processes of one user share on a machine with others: a folder and a token of their own, and no proxy."""
 
 import os
+import secrets
 import shutil
+import stat
 import tempfile
-from collections.abc import Iterator, MutableMapping
+from collections.abc import Callable, Iterator, MutableMapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -49,6 +51,43 @@ def private_folder() -> Iterator[Path]:
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def private_token(folder: Path, warn: Callable[[str], object]) -> Path:
+    """Return the file of a token, which is made if there is none yet, or others could read or replace it.
+
+    Args:
+        folder: that it lies in, as ``token``; made if it is not there.
+        warn: receives what was open to others.
+
+    Raises:
+        UserError: if the folder or the token is somebody else's.
+    """
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    path = folder / "token"
+    if exposed := _exposure(folder, 0o022) or _exposure(path, 0o077):
+        warn(f"{exposed}, open to other users; it is closed, and a new token made")
+        folder.chmod(0o700)
+        path.unlink(missing_ok=True)
+    if not path.exists() or path.stat().st_size == 0:  # empty: a start was killed
+        path.unlink(missing_ok=True)
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+            file.write(secrets.token_hex(32))
+    return path
+
+
+def _exposure(path: Path, closed: int) -> str | None:
+    """Return how others can get at a path by its mode bits `closed`, or None.
+
+    Raises:
+        UserError: if it is a link, or somebody else's.
+    """
+    if not os.path.lexists(path):
+        return None
+    found = path.lstat()
+    if stat.S_ISLNK(found.st_mode) or found.st_uid != os.geteuid():
+        raise UserError(f"{path}: got a link, or another user's; wanted your own; remove it, or give another --folder")
+    return f"{path}: got mode {stat.S_IMODE(found.st_mode):04o}" if found.st_mode & closed else None
 
 
 def bypass_proxies(environment: MutableMapping[str, str]) -> None:
