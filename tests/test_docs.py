@@ -84,13 +84,17 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with what the pages name: the examples, as installed packages, and a run."""
     for package, kind, entry in (
         ("planar_visits", "suites", "planar-visits = planar_visits:PlanarVisits"),
+        ("fetch_reach", "suites", "fetch-reach = fetch_reach:FetchReach"),
         ("reptile", "methods", "reptile = reptile:Reptile"),
     ):
-        shutil.copytree(PROJECT / "docs" / "examples" / package, tmp_path / "lib", dirs_exist_ok=True)
-        (information := tmp_path / "lib" / f"{package}-1.0.dist-info").mkdir()
+        (information := tmp_path / "lib" / f"{package}-1.0.dist-info").mkdir(parents=True)
         (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
         (information / "entry_points.txt").write_text(f"[dmil.{kind}]\n{entry}\n")
         monkeypatch.delitem(sys.modules, package, raising=False)
+    for example in (PROJECT / "docs" / "examples").glob("*/*.py"):
+        shutil.copy(example, tmp_path / "lib")
+    (fetch,) = [block for block in blocks(PROJECT / "docs" / "your-own-task.md", "python") if "FetchReach" in block]
+    (tmp_path / "lib" / "fetch_reach.py").write_text(fetch)
     monkeypatch.syspath_prepend(tmp_path / "lib")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")

@@ -205,7 +205,8 @@ def _episode(file: PlainFile, name: str) -> ExternalEpisode:
         raise DemonstrationError(
             f"{name}: got {len(observations)} observations of {len(actions)} actions; wanted one more, or as many"
         )
-    success = file.array(f"{name}/infos/success") if file.has(f"{name}/infos/success") else None
+    noted = [info for key in ("success", "is_success") if file.has(info := f"{name}/infos/{key}")]
+    success = file.array(noted[0]) if noted else None
     return ExternalEpisode(
         observations[: len(actions)],
         actions.astype(np.float32),

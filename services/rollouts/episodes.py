@@ -35,11 +35,14 @@ class _Recorder:
     def step(self, executed: np.ndarray, recorded: np.ndarray) -> None:
         """Execute an action; the one that is recorded need not be the same."""
         self.observation, _, _, _, self.info = self._env.step(executed)
-        if "success" not in self.info:
-            raise UserError("info of a step: got no success; wanted whether the task is solved; have step() say so")
-        if self.info["success"] and self.solved_at is None:
+        if (success := self.info.get("success", self.info.get("is_success"))) is None:
+            raise UserError(
+                "info of a step: got no success; wanted success or is_success, whether the task is solved; have step() "
+                "say so"
+            )
+        if success and self.solved_at is None:
             self.solved_at = len(self.actions)
-        self._score = max(self._score, int(np.asarray(self.info.get("score", self.info["success"])).item()))
+        self._score = max(self._score, int(np.asarray(self.info.get("score", success)).item()))
         self.observations.append(self.observation.astype(np.float32))
         self.actions.append(recorded.copy())
 

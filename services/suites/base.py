@@ -13,10 +13,10 @@ from dmil_core.points import Points
 
 Environment = gymnasium.Env[np.ndarray, np.ndarray]
 """A task's environment, with a flat observation and actions in a `Box`. ``reset(seed=n)`` twice gives the same episode
-twice. ``info["success"]`` of a step says whether the task is solved. The infos of resets may hold under ``goal``, a
-list of numbers, what was drawn at random. Where there is a score, the infos of steps hold it under ``score``. Where
-observations leave out something that the expert needs, the infos of resets and steps hold the whole ones under
-``full_observation``."""
+twice. ``info["success"]`` of a step, or ``info["is_success"]``, says whether the task is solved. The infos of resets
+may hold under ``goal``, a list of numbers, what was drawn at random. Where there is a score, the infos of steps hold it
+under ``score``. Where observations leave out something that the expert needs, the infos of resets and steps hold the
+whole ones under ``full_observation``."""
 
 
 class Expert(Protocol):

@@ -37,7 +37,7 @@ def test_arrays_in_infos_are_taken(train, workplace: Path, monkeypatch):
 )
 def test_a_missing_success_is_one_message(workplace: Path, monkeypatch, complaint, program):
     monkeypatch.setenv("TOY_ODDITY", "no success")
-    assert "info of a step: got no success; wanted whether the task is solved" in complaint(program, *TOY)
+    assert "info of a step: got no success; wanted success or is_success, whether" in complaint(program, *TOY)
 
 
 def test_an_observation_that_the_simulator_spoils_is_no_failure_of_the_policy(

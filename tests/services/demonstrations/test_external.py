@@ -70,7 +70,7 @@ def minari_set(dataset_id: str, *, nested: bool = False) -> str:
             rewards=[1.0] * len(actions),
             terminations=[False] * len(actions),
             truncations=[False] * (len(actions) - 1) + [True],
-            infos={"success": np.array([False] * len(actions) + [index == 1])},
+            infos={"is_success" if nested else "success": np.array([False] * len(actions) + [index == 1])},
         )
         for index, (observations, actions) in enumerate(EPISODES)
     ]

@@ -328,7 +328,7 @@ BROKEN = {
     "tells nothing": (
         "    def step(self, action):\n        return (*super().step(action)[:4], {})\n",
         2,
-        "planar-visits: info of a step: got no success; wanted whether the task is solved",
+        "planar-visits: info of a step: got no success; wanted success or is_success, whether the task is solved",
     ),
     "raises": (
         "    def step(self, action):\n        return 1 / 0\n",
@@ -366,3 +366,16 @@ def test_the_page_and_the_example_agree():
     page = (PROJECT / "docs" / "your-own-task.md").read_text("utf-8")
     for name, language in (("planar_visits.py", "python"), ("pyproject.toml", "toml")):
         assert f"```{language}\n{(EXAMPLE / name).read_text('utf-8')}```\n" in page
+
+
+def test_an_environment_of_gymnasium_robotics_is_a_suite_in_30_lines(register, capsys):
+    page = (PROJECT / "docs" / "your-own-task.md").read_text("utf-8")
+    (block,) = [each for each in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "FetchReach" in each]
+    assert block.count("\n") <= 30
+    register(f"{block}\nFaulty = FetchReach\n", "fetch-reach")
+    verify = ["verify", "--suite", "fetch-reach", "--seeds", "2", "--runner", "local"]
+    assert exit_code(collect_demos.run, verify) == 0
+    assert "2/2" in capsys.readouterr().out
+    run = ["--suite", "fetch-reach", "--method", "tracking", "--preset", "smoke", "--runner", "local", *SHORT[2:]]
+    assert exit_code(meta_train.run, run) == 0
+    assert "fetch-reach" in capsys.readouterr().out
