@@ -5,7 +5,7 @@ INSTALLED := .venv/installed
 PROCESSES := 3
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train cluster cluster-stop docs test test-all missing tools mutants check-deploy audit clean
+.PHONY: help setup train cluster cluster-stop docs test test-all missing tools mutants fuzz check-deploy audit clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):[^#]*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -74,6 +74,9 @@ tools:
 
 mutants: setup ## put 40 faults into copies of the tree, one by one, and print which test of `make test` notices each
 	@$(BIN)/python -m tests.mutants
+
+fuzz: setup ## for an hour, try random settings, paths, data and faults together; options go in ARGS, as ARGS="--first 17 --count 1"
+	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.faults.combinations $(ARGS)
 
 check-deploy: setup ## of test-all, what holds deploy/ against schemas, checkers and the project; no container engine
 	@command -v promtool >/dev/null || { echo "check-deploy: found no promtool: apt-get install prometheus"; exit 1; }

@@ -2,11 +2,14 @@
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+AGAIN_SECONDS = 0.01
+"""After which a stop is tried again that came in a finaliser or the like, where Python lets no exception pass."""
 
 
 @contextmanager
@@ -14,7 +17,7 @@ def stoppable() -> Iterator[list[int]]:
     """Have a signal to stop end what goes on inside by KeyboardInterrupt; yield the signals that came.
 
     The second is only answered, so that what is being kept, as a checkpoint, is kept; the third ends that too. A signal
-    that is ignored, as SIGHUP under nohup, stays so.
+    that is ignored, as SIGHUP under nohup, stays so. One that comes where Python ignores exceptions comes once more.
     """
     received: list[int] = []
 
@@ -25,6 +28,13 @@ def stoppable() -> Iterator[list[int]]:
         with suppress(OSError):  # no print: it may be at work already
             os.write(2, b"stopping; once more ends at once, and what is being written may be lost\n")
 
+    def unraisable(told: "sys.UnraisableHookArgs") -> None:
+        if told.exc_type is KeyboardInterrupt and received:
+            threading.Timer(AGAIN_SECONDS, signal.raise_signal, [received.pop()]).start()
+        else:
+            hook(told)
+
+    hook, sys.unraisablehook = sys.unraisablehook, unraisable
     before = {number: signal.getsignal(number) for number in STOPS}
     for number in STOPS:
         if before[number] != signal.SIG_IGN:
@@ -32,6 +42,7 @@ def stoppable() -> Iterator[list[int]]:
     try:
         yield received
     finally:
+        sys.unraisablehook = hook
         for number, handler in before.items():
             signal.signal(number, handler)
 

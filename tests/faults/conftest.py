@@ -1,13 +1,13 @@
 """What the tests of faults share: the toy suite as an installed package, and small runs of it."""
 
 import os
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from services import meta_train
+from tests.faults.toy_package import install
 from tests.services import conftest as services
 
 _console, complaint, logged = services._console, services.complaint, services.logged  # fixtures
@@ -23,13 +23,7 @@ SHORT = (
 @pytest.fixture(scope="session")
 def toy_package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the toy suite as pip would install it."""
-    folder = tmp_path_factory.mktemp("toy")
-    shutil.copy(Path(__file__).with_name("toy_suite.py"), folder / "toy_suite.py")
-    information = folder / "toy_suite-1.0.dist-info"
-    information.mkdir()
-    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: toy-suite\nVersion: 1.0\n")
-    (information / "entry_points.txt").write_text("[dmil.suites]\ntoy = toy_suite:ToySuite\n")
-    return folder
+    return install(tmp_path_factory.mktemp("toy"))
 
 
 @pytest.fixture(scope="session")

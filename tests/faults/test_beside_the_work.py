@@ -15,6 +15,7 @@ from dmil_core.files import DiskFullError
 from services import meta_train
 from services.cli import stopping, streams
 from services.cli.arguments import exit_code
+from services.evaluation import evaluator
 from services.experiments import meta_training
 from services.reporting import run_report
 from services.storage.checkpoints import Checkpoints
@@ -154,6 +155,21 @@ def test_each_signal_to_stop_leaves_a_checkpoint_also_when_it_comes_twice(workpl
     assert ended_as(workplace / "runs" / "run") == "KILLED"
 
 
+def test_a_signal_that_comes_where_exceptions_are_ignored_is_not_lost(capsys):
+    class Thing:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGTERM)
+
+    def patient(arguments) -> None:
+        thing = Thing()
+        del thing
+        signal.pause()
+        raise AssertionError("not reached")
+
+    assert exit_code(patient, []) == 143
+    assert capsys.readouterr().err == ""
+
+
 def test_a_third_signal_ends_at_once_and_an_ignored_one_is_ignored():
     def patient(arguments) -> None:
         try:
@@ -195,6 +211,19 @@ def test_a_removed_folder_ends_the_run_in_a_line(workplace, monkeypatch, capsys)
             (workplace / "runs" / "run").rename(workplace / "moved")
 
     monkeypatch.setattr(meta_training.IterationLog, "add", removing)
+    assert exit_code(meta_train.run, [*TOY, *SHORT, "--name", "run"]) == 1
+    assert "error: runs/run: got no such folder any more" in capsys.readouterr().err
+    assert not (workplace / "runs" / "run").exists()
+
+
+def test_a_folder_that_is_moved_away_amid_the_evaluation_is_not_made_anew(workplace, monkeypatch, capsys):
+    rows = evaluator.Evaluator.evaluation
+
+    def moving(*arguments):
+        (workplace / "runs" / "run").rename(workplace / "moved")
+        return rows(*arguments)
+
+    monkeypatch.setattr(evaluator.Evaluator, "evaluation", moving)
     assert exit_code(meta_train.run, [*TOY, *SHORT, "--name", "run"]) == 1
     assert "error: runs/run: got no such folder any more" in capsys.readouterr().err
     assert not (workplace / "runs" / "run").exists()
