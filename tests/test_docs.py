@@ -148,6 +148,15 @@ def test_blocks_of_python_are_run_somewhere():
     assert languages == {"bash", "sh", "python", "yaml", "toml", "text", "math"}, "a test for blocks of another kind"
 
 
+def test_the_navigation_has_every_page_and_the_readme_two_screens():
+    navigation = (PROJECT / "mkdocs.yml").read_text("utf-8").partition("nav:")[2]
+    assert [page.name for page in PAGES[1:] if page.name not in navigation] == [], "add it to mkdocs.yml"
+    readme = PAGES[0].read_text("utf-8").splitlines()
+    assert len(readme) <= 110
+    assert max(map(len, readme)) <= 120
+    assert [line for block in blocks(PAGES[0], "bash") for line in block.splitlines() if len(line) > 80] == []
+
+
 @pytest.mark.thorough
 def test_the_site_is_whole_and_loads_nothing_from_a_network(tmp_path: Path):
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
