@@ -13,8 +13,9 @@ from dmil_core.points import Points, position, present
 
 NEAR = 2.0
 """In units of the hand's reach in a step: so near, the path's next place is next."""
-GAIN = 0.1
-"""Action for each reach of the hand that it is away from the path's place."""
+GAIN = 0.25
+"""Action for each reach of the hand that it is away from the path's place: as Meta-World's experts have it, and on
+twelve of its meta-training tasks better than 0.1 (240 episodes: 0.73 in place of 0.69 with one demonstration)."""
 PATIENCE = 15
 """Steps after which the next place is next anyway."""
 MICRO = 1e-6
