@@ -124,7 +124,9 @@ def test_every_command_line_of_a_page_is_taken(page: Path, workplace: Path):
 
 
 def test_every_flag_in_the_text_of_a_page_is_one():
-    sources = [path for folder in ("dmil_core", "services", "benchmarks") for path in (PROJECT / folder).rglob("*.py")]
+    sources = [
+        path for folder in ("dmil_core", "services", "benchmarks", "tests") for path in (PROJECT / folder).rglob("*.py")
+    ]
     fields = {name for path in sources for name in re.findall(r"^    (\w+): ", path.read_text("utf-8"), re.MULTILINE)}
     known = OTHERS | {"help", ""} | {name.replace("_", "-") for name in fields}
     for page in PAGES:
