@@ -5,7 +5,7 @@ INSTALLED := .venv/installed
 PROCESSES := 3
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train cluster cluster-stop docs test test-all missing tools mutants fuzz check-deploy audit clean
+.PHONY: help setup train evaluate cluster cluster-stop docs test test-all missing tools mutants fuzz check-deploy audit clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):[^#]*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -27,6 +27,10 @@ $(INSTALLED): pyproject.toml constraints.txt
 
 train: setup ## meta-train; its options go in ARGS: make train ARGS="--help"
 	$(BIN)/python -m services.meta_train $(ARGS)
+
+MODEL := ml10
+evaluate: setup ## adapt a shipped model to its new tasks, and compare with its card: make evaluate MODEL=ml45
+	$(BIN)/python -m services.evaluate $(MODEL) --expect $(ARGS)
 
 cluster: setup ## start a Ray head and an MLflow server on this machine, for Ray jobs; options go in ARGS
 	@$(BIN)/python -m services.local_cluster start $(ARGS)

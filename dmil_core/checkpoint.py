@@ -116,7 +116,7 @@ class Manifest(BaseModel):
     versions: dict[str, str]
     mlflow_run_id: str | None
     files: dict[str, str] = {}
-    """The SHA-256 of every file of tensors."""
+    """The SHA-256 of every file of tensors; a model that is there to be adapted has no optimiser's."""
 
     @field_validator("shapes")
     @classmethod
@@ -172,7 +172,11 @@ class Checkpoint:
         self.parameters: Mapping[str, np.ndarray] = self._read(PARAMETERS, self.manifest.shapes)
         """The parameters by name, in their flat order."""
         flat = (self.manifest.size,)
-        self._moments = self._read(OPTIMISER, {"first_moment": flat, "second_moment": flat})
+        self._moments = (
+            self._read(OPTIMISER, {"first_moment": flat, "second_moment": flat})
+            if OPTIMISER in self.manifest.files
+            else None
+        )
         self.constants: Mapping[str, np.ndarray] = self._read(CONSTANTS, None)
         """What the method learned once from the data."""
 
@@ -191,16 +195,25 @@ class Checkpoint:
         return {key: tensors[key] for key in shapes}
 
     @property
+    def flat(self) -> Float[np.ndarray, " parameters"]:
+        """All parameters as one vector, a new copy each time."""
+        return flatten({name: torch.from_numpy(array) for name, array in self.parameters.items()}).numpy()
+
+    @property
     def state(self) -> OuterState:
-        """The learner's state, a new copy each time."""
-        flat = flatten({name: torch.from_numpy(array) for name, array in self.parameters.items()}).numpy()
-        return OuterState(
-            self.manifest.iteration, flat, **{name: array.copy() for name, array in self._moments.items()}
-        )
+        """The learner's state, a new copy each time.
+
+        Raises:
+            CheckpointError: of a model that was exported without it.
+        """
+        if self._moments is None:
+            raise damaged(self.path / OPTIMISER, "none, as of a model to adapt", "a run's, to train on")
+        moments = {name: array.copy() for name, array in self._moments.items()}
+        return OuterState(self.manifest.iteration, self.flat, **moments)
 
     def tensors(self) -> Parameters:
         """Return the parameters, a new copy each time, laid out as in meta-training: the last bits depend on it."""
-        return unflatten(torch.from_numpy(self.state.parameters), self.manifest.torch_shapes)
+        return unflatten(torch.from_numpy(self.flat), self.manifest.torch_shapes)
 
     def method(self, action_dim: int) -> Method[Any]:
         """Return the method that the parameters are of, for actions of so many numbers."""
@@ -333,6 +346,8 @@ def read_manifest(path: Path) -> Manifest:
     """
     manifest = read_sealed(path, MANIFEST, MARKER, MOST_MANIFEST, Manifest)
     for name, least in {PARAMETERS: 4 * manifest.size, OPTIMISER: 8 * manifest.size, CONSTANTS: 1}.items():
+        if name == OPTIMISER and name not in manifest.files:
+            continue  # a model to adapt
         size = (path / name).stat().st_size if (path / name).is_file() else 0
         if size < least:
             raise CheckpointError(f"{path / name}: got {size} bytes; wanted at least {least}; use another checkpoint")

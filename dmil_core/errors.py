@@ -2,12 +2,15 @@
 
 import reprlib
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from difflib import get_close_matches
 
 from pydantic import ValidationError
 
 MOST_LINES = 10
+ALIKE = 0.3
+"""Of the letters of two names, as difflib counts them: what is less alike is not proposed."""
 
 
 class UserError(ValueError):
@@ -83,6 +86,13 @@ _shortened = _Shortened()
 def shorten(value: object) -> str:
     """Return a value as it stands in a message: `repr`, cut short however large the value is."""
     return _shortened.repr(value)
+
+
+def nearest(name: object, known: Iterable[str]) -> str:
+    """Return the three known names that are most like a name, as a message has them in front; nothing if none is."""
+    spelled = {one.lower(): one for one in known}
+    alike = get_close_matches(str(name)[:100].lower(), spelled, n=3, cutoff=ALIKE)
+    return f"the nearest are {', '.join(spelled[one] for one in alike)}; " if alike else ""
 
 
 def describe_errors(error: ValidationError, whole: str = "settings", separator: str = "\n") -> str:

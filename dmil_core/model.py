@@ -12,7 +12,8 @@ from dmil_core.adapted_policy import AdaptedPolicy, Origin
 from dmil_core.checkpoint import FOLDER, MANIFEST, Checkpoint, Manifest, Range, opened
 from dmil_core.configs import ExperimentConfig, SuiteConfig, TrainingConfig
 from dmil_core.demonstrations import Demonstration
-from dmil_core.errors import RunError, UserError, shorten
+from dmil_core.errors import RunError, UserError, nearest, shorten
+from dmil_core.files import at_home
 from dmil_core.methods.base import FineTuning, Policy
 from dmil_core.methods.tracking.config import TrackingConfig
 from dmil_core.methods.tracking.method import Tracking
@@ -24,6 +25,8 @@ from dmil_core.recorded import Interface, action_dim_of, as_demonstrations, unli
 ENTRY_POINTS = "dmil.models"
 """The group of entry points in which a package registers, by the scheme of an address, what reads a checkpoint:
 the services register MLflow's ``models`` and ``runs``."""
+SHIPPED = Path(__file__).with_name("shipped").resolve()
+"""The models that come with the project, in a checkout the folder ``models``."""
 
 
 class UnlikeTrainingWarning(UserWarning):
@@ -130,8 +133,9 @@ def load(name: str | Path, runs: str | Path = "runs") -> Model:
     """Return a model.
 
     Args:
-        name: a run's name in `runs`, or the folder of a run, whose newest whole checkpoint is then taken, or of a
-            checkpoint; or an address as MLflow's ``models:/ml10@champion``.
+        name: the folder of a run, whose newest whole checkpoint is then taken, or of a checkpoint; a run's name in
+            `runs`; the name of a model that comes with the project, as ml10; or an address as MLflow's
+            ``models:/ml10@champion``. The first of these that there is counts.
         runs: the folder that runs' own folders are in.
 
     Raises:
@@ -140,12 +144,29 @@ def load(name: str | Path, runs: str | Path = "runs") -> Model:
     scheme, colon, _ = str(name).partition(":/")
     if colon and not Path(name).exists():
         return Model(_fetched(scheme, str(name)))
-    for folder in (Path(name), Path(runs) / name):
+    return Model(opened(model_folder(name, runs), lambda damaged: warnings.warn(damaged, stacklevel=4)))
+
+
+def model_folder(name: str | Path, runs: str | Path = "runs", field: str = "name") -> Path:
+    """Return the folder of a run or of a checkpoint on this machine, as `load` finds it.
+
+    Args:
+        name: as `load`'s, but no address.
+        runs: the folder that runs' own folders are in.
+        field: what to name in a message.
+
+    Raises:
+        UserError: if there is none; names the nearest ones.
+    """
+    for folder in (at_home(name), Path(runs) / name, SHIPPED / name):
         if (folder / MANIFEST).exists() or (folder / FOLDER).is_dir():
-            return Model(opened(folder, lambda damaged: warnings.warn(damaged, stacklevel=4)))
+            return folder
+    shipped = [path.parent.name for path in sorted(SHIPPED.glob(f"*/{MANIFEST}"))]
+    of_runs = [path.parent.name for path in sorted(Path(runs).glob(f"*/{FOLDER}"))]
     raise UserError(
-        f"name: got {shorten(str(name))}; wanted the folder of a run or of a checkpoint, the name of a run in {runs}, "
-        "or models:/NAME@champion"
+        f"{field}: got {shorten(str(name))}; wanted the folder of a run or of a checkpoint, the name of a run in "
+        f"{runs}, or a model that comes with the project ({', '.join(shipped) or 'none here'}); "
+        f"{nearest(name, [*of_runs, *shipped])}an address is models:/NAME@champion"
     )
 
 

@@ -37,7 +37,7 @@ from services.tracking.ownership import IDENTITY
 from services.tracking.system import recording_system
 from services.tracking.tracker import Tracker
 
-CONFIGS = Path(__file__).parents[1] / "tune_configs"
+CONFIGS = Path(__file__).with_name("tune_configs").resolve()
 TUNE_SETTINGS = {
     "RAY_CHDIR_TO_TRIAL_DIR": "0",
     "TUNE_DISABLE_SIGINT_HANDLER": "1",

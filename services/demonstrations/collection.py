@@ -2,7 +2,7 @@
 
 import logging
 from collections import Counter
-from collections.abc import Generator, Sequence
+from collections.abc import Collection, Generator, Sequence
 from contextlib import closing
 from functools import cached_property
 
@@ -44,18 +44,24 @@ class DemonstrationCollection:
         self._names = list(dict.fromkeys((*suite.train_tasks, *suite.test_tasks)))
         self._places = self._find_places()
 
-    def collect(self, runner: Runner) -> dict[str, TaskDemonstrations]:
+    def collect(self, runner: Runner, only: Collection[str] | None = None) -> dict[str, TaskDemonstrations]:
         """Return every task's demonstrations, letting the experts make those that are not in the store.
 
         The first successes in the order of the attempts' numbers are kept, so the outcome does not depend on who
         simulates what.
 
+        Args:
+            runner: does the work.
+            only: some of the tasks, to be evaluated alone.
+
         Raises:
             DemonstrationError: if an expert hardly ever succeeds, a task has none, or a data set cannot be used.
         """
         settings = self._config.demonstrations
-        datasets = dict(self.recorded)
-        wanted = [task for task in self._names if task not in datasets]
+        self.check_recorded(only)
+        names = [task for task in self._names if only is None or task in only]
+        datasets = {task: dataset for task, dataset in self._recorded.items() if task in names}
+        wanted = [task for task in names if task not in datasets]
         ids = {task: self._store.dataset_id(task, self._suite, settings) for task in wanted}
         missing = []
         for task, dataset_id in ids.items():
@@ -79,7 +85,7 @@ class DemonstrationCollection:
                     failed=kept[-1] + 1 - len(kept),
                     settings={"protocol": self._suite.protocol, **settings.model_dump()},
                 )
-        return {task: datasets[task] for task in self._names}
+        return {task: datasets[task] for task in names}
 
     def _checked(self, dataset: TaskDemonstrations) -> TaskDemonstrations:
         """Return a stored data set that fits the suite, which may have been changed since."""
@@ -104,27 +110,35 @@ class DemonstrationCollection:
         return places
 
     @cached_property
-    def recorded(self) -> dict[str, TaskDemonstrations]:
-        """The data sets that the settings name, read once.
+    def _recorded(self) -> dict[str, TaskDemonstrations]:
+        """The data sets that the settings name, read once."""
+        evaluation, most = self._config.evaluation, self._config.demonstrations.per_task
+        datasets = {task: demonstrations(task, at, self._suite, most) for task, at in self._places.items()}
+        for task, dataset in datasets.items():
+            got = len(dataset.demonstrations)
+            if got < max(evaluation.shots) * evaluation.support_draws and task not in self._suite.train_tasks:
+                sets = ", ".join(f"{got // size} of {size}" for size in evaluation.shots)
+                logger.info(f"{dataset.id}: {got} demonstrations of {task} make these disjoint support sets: {sets}")
+        return datasets
+
+    def check_recorded(self, only: Collection[str] | None = None) -> None:
+        """Read the data sets that the settings name, once, and see whether their demonstrations suffice.
+
+        Args:
+            only: the tasks that are evaluated, where none is trained on.
 
         Raises:
             DemonstrationError: for one that cannot be used, or has too few demonstrations.
         """
-        settings, evaluation = self._config.demonstrations, self._config.evaluation
-        datasets = {task: demonstrations(task, at, self._suite, settings.per_task) for task, at in self._places.items()}
-        shots = max(evaluation.shots)
-        for task, dataset in datasets.items():
-            wanted = settings.held_out + 1 if task in self._suite.train_tasks else shots
+        settings, shots = self._config.demonstrations, max(self._config.evaluation.shots)
+        for task, dataset in self._recorded.items():
+            wanted = settings.held_out + 1 if only is None and task in self._suite.train_tasks else shots
             if (got := len(dataset.demonstrations)) < wanted:
                 raise DemonstrationError(
                     f"{dataset.id}: got {got} demonstrations of {task}; wanted at least {wanted}: {shots} for a "
                     "support set, and for a meta-training task one more than demonstrations.held_out; record more, or "
                     "lower that or evaluation.shots"
                 )
-            if got < shots * evaluation.support_draws and task not in self._suite.train_tasks:
-                sets = ", ".join(f"{got // size} of {size}" for size in evaluation.shots)
-                logger.info(f"{dataset.id}: {got} demonstrations of {task} make these disjoint support sets: {sets}")
-        return datasets
 
     def _attempt(self, runner: Runner, tasks: Sequence[str]) -> Generator[tuple[str, list[Episode]]]:
         """Yield each task's attempts as soon as enough are successes, in the order of their numbers."""

@@ -97,7 +97,7 @@ class Evaluator:
     def items(self, checkpoint: Checkpoint, kind: type[Item]) -> list[Item]:
         """Return a work item of `kind` for each adaptation; the checkpoint is not read again."""
         method, shapes = checkpoint.method(self._suite.action_dim), checkpoint.manifest.torch_shapes
-        parameters, config = self._runner.share(checkpoint.state.parameters), self.config
+        parameters, config = self._runner.share(checkpoint.flat), self.config
         return [
             kind(method, shapes, parameters, adaptation, self._shared[adaptation.task], config.evaluation, config.seed)
             for adaptation in self.adaptations

@@ -76,21 +76,28 @@ class Experiment:
 
     # Demonstrations
 
-    def read_sources(self) -> None:
+    def read_sources(self, only: Collection[str] | None = None) -> None:
         """Read the data sets that the settings name, so that what is wrong with one is said before anything is made.
 
         Raises:
             DemonstrationError: as `collect`.
         """
-        _ = self._collection.recorded
+        self._collection.check_recorded(self._to_collect(only))
 
-    def collect(self, runner: Runner) -> dict[str, TaskDemonstrations]:
+    def collect(self, runner: Runner, only: Collection[str] | None = None) -> dict[str, TaskDemonstrations]:
         """Return every task's demonstrations, see `DemonstrationCollection`.
+
+        Args:
+            runner: does the work.
+            only: the tasks that will be evaluated, where nothing is trained; controls need those of the others too.
 
         Raises:
             DemonstrationError: if an expert hardly ever succeeds, a task has none, or a data set cannot be used.
         """
-        return self._collection.collect(runner)
+        return self._collection.collect(runner, self._to_collect(only))
+
+    def _to_collect(self, only: Collection[str] | None) -> Collection[str] | None:
+        return None if self.config.evaluation.controls else only
 
     def training_sets(self, data: Mapping[str, TaskDemonstrations]) -> dict[str, Sequence[Demonstration]]:
         """Return what meta-training may see: the demonstrations of its tasks, without those held out."""
@@ -100,7 +107,7 @@ class Experiment:
     def held_out_sets(self, data: Mapping[str, TaskDemonstrations]) -> dict[str, Sequence[Demonstration]]:
         """Return what support sets are drawn from, for the tasks of both splits."""
         held_out = self.config.demonstrations.held_out
-        return {task: data[task].demonstrations[-held_out:] for _, task in self.tasks}
+        return {task: data[task].demonstrations[-held_out:] for _, task in self.tasks if task in data}
 
     # Meta-training
 

@@ -21,13 +21,15 @@ from services.tracking.history import Origin, read_metrics, read_origin
 Result = TypeVar("Result", EpisodeResult, AdaptationResult)
 MARK, BEGUN, CHECKPOINTS = "summary.json", "config.json", "checkpoints"
 """What the folder of a finished run is known by, what that of any run, and what no evaluation's has."""
+EVALUATED = "evaluation.json"
+"""In the folder of an evaluation: the settings that were in force."""
 MOST_BYTES = 2**24
 """In it."""
 
 
 @dataclass(frozen=True)
 class FinishedRun(EvaluationFolder):
-    """What ``meta_train`` left behind; each file is read when it is first used, once."""
+    """What ``meta_train`` or ``evaluate`` left behind; each file is read when it is first used, once."""
 
     @staticmethod
     def find(name: str, runs: Path) -> "FinishedRun":
@@ -46,17 +48,22 @@ class FinishedRun(EvaluationFolder):
                         f"with it: {resume_command(begun)}"
                     ) from error
             raise
-        if not (folder / CHECKPOINTS).is_dir():
+        if not (folder / CHECKPOINTS).is_dir() and not (folder / EVALUATED).is_file():
             raise UserError(
-                f"RUN: got {folder}, which has no {CHECKPOINTS}, as the folder of an evaluation; wanted that of a run "
-                "of services.meta_train"
+                f"RUN: got {folder}, which has neither {CHECKPOINTS} nor {EVALUATED}; wanted the folder of a run "
+                "or of an evaluation"
             )
         return FinishedRun(folder)
 
     @property
     def name(self) -> str:
         """Its folder's."""
-        return self.folder.name
+        return f"evaluation {self.folder.name}" if self.is_evaluation else self.folder.name
+
+    @property
+    def is_evaluation(self) -> bool:
+        """Whether it evaluated the checkpoint of another run."""
+        return (self.folder / EVALUATED).is_file()
 
     @cached_property
     def summary(self) -> Summary:
@@ -93,16 +100,20 @@ class FinishedRun(EvaluationFolder):
 
     @cached_property
     def checkpoint(self) -> Checkpoint:
-        """The last one.
+        """The last one; of an evaluation that which was evaluated.
 
         Raises:
             CheckpointError: if there is none, or it is damaged.
         """
+        if self.is_evaluation:
+            return Checkpoint(Path(self.summary.checkpoint))
         return Checkpoints(self.folder / CHECKPOINTS, kept=0).newest()
 
     @cached_property
     def config(self) -> ExperimentConfig:
-        """All settings."""
+        """All settings; of an evaluation those that were in force."""
+        if self.is_evaluation:
+            return read_json(self.folder, EVALUATED, ExperimentConfig, MOST_BYTES, "evaluate again")
         return self.checkpoint.manifest.config
 
     @cached_property
@@ -145,4 +156,5 @@ class FinishedRun(EvaluationFolder):
     @cached_property
     def demonstrations(self) -> dict[str, TaskDemonstrations]:
         """Every task's, collected again where the store has lost them."""
-        return self.experiment.collect(LocalRunner(self.experiment.suite))
+        only = {row.task for row in self.episodes} if self.is_evaluation else None
+        return self.experiment.collect(LocalRunner(self.experiment.suite), only)

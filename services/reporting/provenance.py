@@ -2,7 +2,7 @@
 
 import shlex
 
-from dmil_core.configs import DEFAULT_METHOD
+from dmil_core.configs import DEFAULT_METHOD, ExperimentConfig
 from services.experiments.finished_run import FinishedRun
 from services.reporting.page import Commands, DataTable, Part, Prose, Section
 from services.reporting.settings import flags, nearest_preset
@@ -16,15 +16,11 @@ MOST_ROWS = 6000
 def origin_of_run(finished: FinishedRun) -> Section:
     """Return the section with commands, demonstrations, the commit, versions and seconds."""
     manifest, commits = finished.checkpoint.manifest, ", then ".join(finished.origin.commits)
-    checkpoint, folder = shlex.quote(str(finished.checkpoint.path)), shlex.quote(str(finished.folder))
     parts: list[Part] = [
-        Commands("To train and evaluate it again", [_training(finished)]),
+        Commands("To train and evaluate it again", [training_command(finished.checkpoint.manifest.config)]),
         Commands(
-            "To evaluate its last checkpoint again, and to write this page again",
-            [
-                f"dmil evaluate --checkpoint {checkpoint} --output evaluation",
-                f"dmil report run {folder}",
-            ],
+            "To evaluate the checkpoint again, and to write this page again",
+            [_evaluating(finished), f"dmil report run {shlex.quote(str(finished.folder))}"],
         ),
         Prose(
             f"Commit of the code: {commits or 'unknown'}. Digest of the checkpoint: "
@@ -38,8 +34,21 @@ def origin_of_run(finished: FinishedRun) -> Section:
     return Section("Where it comes from", parts)
 
 
-def _training(finished: FinishedRun) -> str:
-    config, nearest = finished.config, nearest_preset(finished.config)
+def _evaluating(finished: FinishedRun) -> str:
+    trained, now = finished.checkpoint.manifest.config, finished.config
+    other = {
+        f"evaluation.{name}": value for name, value in now.evaluation if value != getattr(trained.evaluation, name)
+    }
+    if now.suite.test_tasks != trained.suite.test_tasks:
+        other["tasks"] = now.suite.test_tasks
+    if now.demonstrations.source != trained.demonstrations.source:
+        other["demos"] = now.demonstrations.source
+    return f"dmil evaluate {shlex.quote(str(finished.checkpoint.path))} {flags(other)}".rstrip()
+
+
+def training_command(config: ExperimentConfig) -> str:
+    """Return the line that trains and evaluates with these settings."""
+    nearest = nearest_preset(config)
     method = config.method.name
     named = "" if method == DEFAULT_METHOD else f" --method {method}"
     command = f"python -m services.meta_train --suite {config.suite.name} --preset {nearest.size}{named}"

@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel
 
 from dmil_core.configs import BASE_PRESETS, ExperimentConfig, preset_of
+from dmil_core.errors import UserError
 from services.experiments.finished_run import FinishedRun
 from services.reporting.page import DataTable, Part, Prose, Section
+from services.suites.registry import open_suite
 
 
 class Nearest(NamedTuple):
@@ -23,13 +25,24 @@ class Nearest(NamedTuple):
 
 def nearest_preset(config: ExperimentConfig) -> Nearest:
     """Return the preset of a run's own suite and method that is nearest to its settings."""
-    settings = _flat(config.model_dump())
+    settings = _flat(_as_given(config).model_dump())
     presets = []
     for size in BASE_PRESETS:
         preset = _flat(preset_of(config.suite.name, size, config.method.name).model_dump())
         differing = {name: value for name, value in settings.items() if name not in preset or preset[name] != value}
         presets.append(Nearest(size, preset, differing))
     return min(presets, key=lambda nearest: len(nearest.differing))
+
+
+def _as_given(config: ExperimentConfig) -> ExperimentConfig:
+    """Return settings without points that the suite itself declares, as a run adds them."""
+    try:
+        declared = getattr(open_suite(config.suite), "points", None)
+    except UserError:  # its package is not here
+        declared = None
+    if declared is None or config.suite.points != declared:
+        return config
+    return config.model_copy(update={"suite": config.suite.model_copy(update={"points": None})})
 
 
 def flags(settings: Mapping[str, Any]) -> str:

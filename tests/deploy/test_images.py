@@ -143,6 +143,7 @@ def test_the_context_has_the_programs_and_no_more():
     for path in (
         "services/reporting/templates/page.html",
         "services/evaluation/paper_results.json",
+        "models/ml10/manifest.json",
         "tune_configs/em.yaml",
     ):
         assert (PROJECT / path).is_file()

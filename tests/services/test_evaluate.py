@@ -2,17 +2,24 @@
 
 import json
 import os
+import re
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mlflow import MlflowClient
 
 from services import evaluate
 from services.demonstrations.store import DemoStore
 from services.evaluation.results import EpisodeResult, read_rows
-from services.storage.folder_lock import held
+
+
+def made() -> Path:
+    """Return the folder of the one evaluation that was made beside the run."""
+    (folder,) = Path("runs/run/evaluations").iterdir()
+    return folder
 
 
 @pytest.fixture
@@ -21,7 +28,7 @@ def trained(copied_run: Callable[[int], Path]) -> Path:
 
 
 def test_it_finds_what_the_run_itself_found(programs, trained: Path):
-    code, printed = programs("evaluate", "--checkpoint", "runs/run", "--output", "again", "--runner", "local")
+    code, printed = programs("evaluate", "run", "--output", "again", "--runner", "local")
     assert code == 0, printed
     for name in ("episodes.jsonl", "adaptations.jsonl"):
         assert Path("again", name).read_bytes() == (trained / name).read_bytes()
@@ -29,6 +36,13 @@ def test_it_finds_what_the_run_itself_found(programs, trained: Path):
     for key in ("rows", "sub_skills", "checkpoint_digest", "protocol", "seed"):
         assert again[key] == before[key]
     assert Path("again/report/table.md").read_text() == (trained / "report" / "table.md").read_text()
+    page = Path("again/report/report.html").read_text()
+    assert "evaluation again: dmil on ml10" in page
+    assert "Success of each task" in page
+    (run_id,) = re.findall(r"MLflow run: (\w+) at", printed)
+    run = MlflowClient(os.environ["MLFLOW_TRACKING_URI"]).get_run(run_id)
+    assert run.data.tags["evaluation_of"] == "runs/run/checkpoints/iteration-0000003"
+    assert run.data.metrics["success_rate/meta-testing/1-shot"] == again["rows"][1]["success_rate"]
 
 
 @pytest.mark.usefixtures("trained")
@@ -57,15 +71,15 @@ def test_controls_stand_beside_the_run(programs):
 def test_settings_of_the_evaluation_may_differ():
     flags = ["--evaluation.shots", "2", "4", "--evaluation.episodes", "2", "--evaluation.fine-tuning-steps", "3"]
     evaluate.run(["--checkpoint", "runs/run/checkpoints/iteration-0000003", "--runner", "local", *flags])
-    rows = [json.loads(line) for line in Path("evaluation/episodes.jsonl").read_text().splitlines()]
+    rows = [json.loads(line) for line in (made() / "episodes.jsonl").read_text().splitlines()]
     assert Counter((row["shots"], len(row["support"])) for row in rows) == {(2, 2): 8, (4, 4): 8}
     assert {row["fine_tuning_steps"] for row in rows} == {3}
 
 
 @pytest.mark.usefixtures("trained")
 def test_other_tasks_are_meta_testing_tasks(store: DemoStore):
-    evaluate.run(["--checkpoint", "runs/run", "--runner", "local", "--tasks", "push-around-wall"])
-    rows = read_rows(Path("evaluation/episodes.jsonl"), EpisodeResult)
+    evaluate.run(["run", "--runner", "local", "--tasks", "push-around-wall"])
+    rows = read_rows(made() / "episodes.jsonl", EpisodeResult)
     assert {(row.suite, row.split, row.task, row.shots) for row in rows} == {
         ("ml10-part", "meta-testing", "push-around-wall", 1)
     }
@@ -73,26 +87,38 @@ def test_other_tasks_are_meta_testing_tasks(store: DemoStore):
     assert (folder / "SHA256SUMS").is_file(), "its demonstrations are collected for it"
 
 
-@pytest.mark.thorough
-@pytest.mark.usefixtures("trained")
-def test_a_second_evaluation_replaces_the_rows_of_the_first():
-    for _ in range(2):
-        evaluate.run(["--checkpoint", "runs/run", "--runner", "local"])
-    assert len(Path("evaluation/episodes.jsonl").read_text().splitlines()) == 4
+@pytest.mark.usefixtures("trained", "plain_pages")
+def test_support_sets_are_drawn_from_demonstrations_of_ones_own_and_no_evaluation_is_overwritten(data):
+    own = data["door-close"].demonstrations[:3]
+    observations, actions = (
+        np.concatenate([getattr(one, name) for one in own]) for name in ("observations", "actions")
+    )
+    np.savez("mine.npz", observations=observations, actions=actions, episode_lengths=[len(one) for one in own])
+    for task in ("reach", "door-close"):  # one is a meta-training task of the run
+        evaluate.run(["run", "--runner", "local", "--demos", f"npz:{task}=mine.npz", "--evaluation.shots", "2"])
+    one, other = sorted(Path("runs/run/evaluations").iterdir())
+    assert one != other
+    for folder, task in ((one, "reach"), (other, "door-close")):
+        rows = read_rows(folder / "episodes.jsonl", EpisodeResult)
+        assert {(row.split, row.task, row.support) for row in rows} == {("meta-testing", task, ("000", "001"))}
+        again = json.loads((folder / "evaluation.json").read_text())
+        assert again["demonstrations"]["source"] == f"npz:{task}=mine.npz"
 
 
 @pytest.mark.usefixtures("trained")
-def test_a_folder_that_another_evaluation_writes_to_is_refused(complaint):
-    with held(Path("evaluation")):
-        said = complaint(evaluate.run, "--checkpoint", "runs/run", "--runner", "local")
-    assert f"evaluation: got process {os.getpid()} of" in said
-    assert not Path("evaluation/episodes.jsonl").exists()
+def test_a_folder_that_is_there_is_refused_and_nothing_is_left(complaint):
+    Path("there").mkdir()
+    assert "--output: got there, which is there already" in complaint(evaluate.run, "run", "--output", "there")
+    assert "got nothing" in complaint(evaluate.run, "run", "--demos", "minari:reach=none")
+    assert not list(Path("there").iterdir())
+    assert not Path("runs/run/evaluations").exists()
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--checkpoint", "nowhere"), ("error: nowhere/manifest.json: got ",)),
+        (("--checkpoint", "nowhere"), ("--checkpoint: got 'nowhere'", "a run in runs")),
+        (("rum",), ("--checkpoint: got 'rum'", "the nearest are run")),
         (("--checkpoint", "runs/run"), ("iteration-0000003/parameters.safetensors", "got 0 bytes")),
         (("--checkpoint", "runs/run", "--evaluation.shots", "5"), ("held_out", "got 4", "wanted at least 5")),
         (
@@ -102,7 +128,7 @@ def test_a_folder_that_another_evaluation_writes_to_is_refused(complaint):
         (("--checkpoint", "runs/run", "--tasks", "fly"), ("suite.test_tasks", "got fly", "reach")),
         ((), ("--checkpoint",)),
     ],
-    ids=["missing", "damaged", "more shots than held out", "no episode", "unknown task", "not given"],
+    ids=["missing", "a typo", "damaged", "more shots than held out", "no episode", "unknown task", "not given"],
 )
 def test_a_mistake_is_answered_with_what_is_allowed(complaint, trained: Path, arguments, words):
     if "parameters.safetensors" in words[0]:

@@ -144,7 +144,7 @@ def test_what_is_no_finished_run_is_reported_in_words(finished: FinishedRun, tmp
     evaluation = tmp_path / "evaluation"
     evaluation.mkdir()
     shutil.copy(finished.folder / "summary.json", evaluation)
-    assert "has no checkpoints, as the folder of an evaluation" in complaint(report.run, "run", "evaluation")
+    assert "has neither checkpoints nor evaluation.json" in complaint(report.run, "run", "evaluation")
     message = complaint(report.run, "run", str(finished.folder), "--output", str(tmp_path))
     assert f"--output: got {tmp_path}, a folder; wanted a file" in message
     damaged = tmp_path / "runs" / "damaged"
