@@ -1,10 +1,16 @@
-"""Show a data set's episodes, and what is wrong with them: a Minari data set, an HDF5 file as D4RL's, an npz file."""
+"""Show a data set's episodes, what is wrong with them, and the line or the flag that mends it.
+
+Read are Minari's data sets, HDF5 files as D4RL, robomimic and LIBERO have them, npz files and folders of them, pairs of
+npy files, and LeRobot's data sets on disk. For example:
+
+  dmil collect-demos inspect mine.npz --suite ml10
+"""
 
 import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import tyro
@@ -21,13 +27,38 @@ from services.demonstrations.layouts import looks_like
 from services.suites.base import TaskSuite
 from services.suites.registry import open_suite
 
+LEAVE_OUT = "leave such episodes out where the file is made, as in the six lines of docs/data.md:"
+MENDINGS = {
+    "acting clips": "actions = np.clip(actions, -1, 1); or, in another unit, actions / np.abs(actions).max(axis=0)",
+    "not copied": "where it is recorded: observations.append(observation.copy())",
+    "in a robot's units": "in metres and radians: observations / 1000, np.deg2rad(observations)",
+    "cuts each step off": "mark last steps only: terminals &= ~np.append(False, terminals[:-1])",
+    "its end is not marked": "timeouts[-1] = True",
+    " wants ": "give --suite one that has these numbers, or choose and order them: observations[:, [0, 1, 2]]",
+    "wanted the 30 of a state": "give --suite another than the kitchen, or choose the state: observations[:, :30]",
+}
+"""The lines that mend what is wrong, by words of it; what has none is left out."""
+
+
+class Problem(NamedTuple):
+    """What is wrong with an episode."""
+
+    episode: int
+    what: str
+
+    @property
+    def words(self) -> str:
+        """In words, with the episode's number."""
+        return f"episode {self.episode}: {self.what}"
+
 
 @dataclass(frozen=True)
 class Arguments:
     """Arguments of ``collect_demos inspect``."""
 
     data: Annotated[str, tyro.conf.Positional]
-    """An id of Minari's, an HDF5 file or an npz file; see docs/data.md."""
+    """minari:ID, hdf5:PATH, npz:PATH, npz:FOLDER, npy:OBS.npy+ACTIONS.npy or lerobot:FOLDER; or an id, a file or
+    a folder alone. See docs/data.md."""
     suite: str | None = None
     """Also check that it fits this suite; in the kitchen, replay each episode and show the sub-tasks that it does."""
 
@@ -40,22 +71,48 @@ def run(arguments: Sequence[str]) -> None:
     """
     args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
     suite = None if args.suite is None else open_suite(suite_settings(args.suite))
-    form = args.data.partition(":")[0]
-    file = at_home(args.data)
-    if form not in FORMS and file.suffix not in SUFFIXES and file.is_file():
-        raise DemonstrationError(
-            f"{args.data}: got {looks_like(file)}; wanted one of {', '.join(SUFFIXES)}, or the id of a Minari data "
-            "set, see docs/data.md"
-        )
-    place = args.data if form in FORMS else f"{SUFFIXES.get(file.suffix, 'minari')}:{args.data}"
+    place = _place_of(args.data)
     episodes = read_episodes(place)
     console.print(_table(place, episodes, suite))
     problems = [*_problems(episodes, suite)]
     for problem in problems:
-        console.print(problem)
+        console.print(problem.words, soft_wrap=True)
+    for mending, numbers in _mendings(problems).items():
+        console.print(f"to mend it: {mending}", soft_wrap=True)
+        if mending == LEAVE_OUT:
+            console.print(f"  episodes = [one for n, one in enumerate(episodes) if n not in {sorted(numbers)}]")
     if problems:
         raise RunError(f"{place}: {len(problems)} things are wrong with {len(episodes)} episodes, see above")
-    console.print("nothing is wrong with it")
+    console.print(f"nothing is wrong with it; to use it: --demos {place}", soft_wrap=True)
+
+
+def _place_of(data: str) -> str:
+    """Return a data set by its form and place.
+
+    Raises:
+        DemonstrationError: for a file of another kind.
+    """
+    file = at_home(data)
+    if data.partition(":")[0] in FORMS:
+        return data
+    if file.is_dir():
+        return f"{'lerobot' if (file / 'meta').is_dir() else 'npz'}:{data}"
+    if file.is_file() and file.suffix not in SUFFIXES:
+        got = "one array of a pair" if file.suffix == ".npy" else looks_like(file)
+        raise DemonstrationError(
+            f"{data}: got {got}; wanted minari:ID, hdf5:PATH, npz:PATH, npz:FOLDER, npy:OBS.npy+ACTIONS.npy or "
+            "lerobot:FOLDER; see docs/data.md"
+        )
+    return f"{SUFFIXES.get(file.suffix, 'minari')}:{data}"
+
+
+def _mendings(problems: Sequence[Problem]) -> dict[str, set[int]]:
+    """Return what mends them, each once, and the episodes that it is for."""
+    episodes: dict[str, set[int]] = defaultdict(set)
+    for problem in problems:
+        mending = next((line for words, line in MENDINGS.items() if words in problem.words), LEAVE_OUT)
+        episodes[mending].add(problem.episode)
+    return episodes
 
 
 def _table(place: str, episodes: Sequence[ExternalEpisode], suite: TaskSuite | None) -> Table:
@@ -97,30 +154,30 @@ def _demonstration(episode: ExternalEpisode, index: int, suite: TaskSuite | None
     return Demonstration(f"{index:03d}", "recorded", state_of(episode.observations), episode.actions)
 
 
-def _problems(episodes: Sequence[ExternalEpisode], suite: TaskSuite | None) -> Iterator[str]:
+def _problems(episodes: Sequence[ExternalEpisode], suite: TaskSuite | None) -> Iterator[Problem]:
     """Yield what keeps a data set from being learned from, and what looks like a mistake."""
     odd: dict[int, list[str]] = defaultdict(list)
     for index, oddity in oddities(episodes):
         odd[index].append(oddity)
     for index, one in enumerate(episodes):
-        yield from (f"episode {index}: {oddity}" for oddity in odd[index])
+        yield from (Problem(index, oddity) for oddity in odd[index])
         if not one.whole:
-            yield f"episode {index}: its end is not marked; its {len(one.actions)} steps are left out"
+            yield Problem(index, f"its end is not marked; its {len(one.actions)} steps are left out")
         elif len(one.actions) == 1 and one.problem is None:
-            yield f"episode {index}: a single step"
+            yield Problem(index, "a single step")
         try:
             demonstration = _demonstration(one, index, suite)
         except DemonstrationError as error:
-            yield f"episode {index}: {error}"
+            yield Problem(index, str(error))
             continue
         if suite is not None:
-            yield from (f"episode {index}: {misfit}" for misfit in misfits(demonstration, suite))
+            yield from (Problem(index, misfit) for misfit in misfits(demonstration, suite))
         if (far := np.abs(one.actions).max()) > 1:
-            yield f"episode {index}: actions of up to {far:.3g}; wanted -1 to 1: acting clips what lies outside"
+            yield Problem(index, f"actions of up to {far:.3g}; wanted -1 to 1: acting clips what lies outside")
         if len(one.actions) > 1 and not one.actions.std(axis=0).any():
-            yield f"episode {index}: the same action at every step"
+            yield Problem(index, "the same action at every step")
         if one.success is False:
-            yield f"episode {index}: no step is a success"
+            yield Problem(index, "no step is a success")
 
 
 if __name__ == "__main__":

@@ -139,7 +139,7 @@ def test_safe_reading_is_let_through(source: str):
 )
 def test_files_that_a_page_names_exist(page: Path):
     named = re.findall(
-        r"`((?:benchmarks|deploy|dmil_core|docs|services|tests|tune_configs)/[\w./-]+)`", page.read_text("utf-8")
+        r"`((?:benchmarks|deploy|dmil_core|docs|models|services|tests|tune_configs)/[\w./-]+)`", page.read_text("utf-8")
     )
     made = ("deploy/secrets/",)  # by a script, for one machine alone
     places = [name for name in named if "NAME" not in name and not name.startswith(made)]

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmil_core.demonstrations import digest
+from dmil_core.demonstrations import DemonstrationError, digest
 from dmil_core.errors import RunError
 from services import collect_demos, meta_train
 from services.demonstrations.store import DemoStore, TaskDemonstrations
@@ -59,8 +59,18 @@ def test_inspect_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "episode 1: actions of up to 2; wanted -1 to 1" in printed
     assert "episode 1: the same action at every step" in printed
     assert "episode 2: the same as episode 0" in printed
+    assert "to mend it: actions = np.clip(actions, -1, 1)" in printed
+    assert "episodes = [one for n, one in enumerate(episodes) if n not in [1, 2]]" in printed
     collect_demos.run(["inspect", write_npz(tmp_path / "b.npz", [good]), "--suite", "ml10"])
-    assert "nothing is wrong with it" in capsys.readouterr().out
+    assert f"nothing is wrong with it; to use it: --demos npz:{tmp_path / 'b.npz'}" in capsys.readouterr().out
+    collect_demos.run(["inspect", str(tmp_path / "b.npz")])
+    np.save(tmp_path / "alone.npy", good[0])
+    with pytest.raises(DemonstrationError, match=r"one array of a pair; wanted minari:ID, hdf5:PATH, .*lerobot:FOLDER"):
+        collect_demos.run(["inspect", str(tmp_path / "alone.npy")])
+    (tmp_path / "folder").mkdir()
+    np.savez(tmp_path / "folder" / "one.npz", observations=good[0], actions=good[1])
+    collect_demos.run(["inspect", str(tmp_path / "folder")])
+    capsys.readouterr()
     with pytest.raises(RunError):
         collect_demos.run(["inspect", str(tmp_path / "b.npz"), "--suite", "kitchen"])
     assert "wanted the 30 of a state" in capsys.readouterr().out

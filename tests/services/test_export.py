@@ -33,8 +33,8 @@ def test_a_run_becomes_a_model_that_adapts_alike_and_cannot_be_trained_on(copied
     ]  # fmt: skip
     before, after = dmil.load(run), dmil.load("mine")
     demonstrations = data["reach"].demonstrations[:1]
-    actions = [model.adapt(demonstrations, steps=2)(demonstrations[0].observations[3]) for model in (before, after)]
-    np.testing.assert_array_equal(*actions)
+    one, other = (model.adapt(demonstrations, steps=2)(demonstrations[0].observations[3]) for model in (before, after))
+    np.testing.assert_array_equal(one, other)
     with pytest.raises(CheckpointError, match=f"{OPTIMISER}: got none, as of a model to adapt"):
         _ = after.checkpoint.state
     card = Path("mine/README.md").read_text()
