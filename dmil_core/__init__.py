@@ -4,7 +4,7 @@ From somebody's checkpoint and a few demonstrations to a policy::
 
     import dmil_core as dmil
 
-    model = dmil.load("runs/ml45")
+    model = dmil.load("ml45")
     policy = model.adapt([(observations, actions)] * 3)
     policy.reset()
     action = policy(observation)
