@@ -8,7 +8,7 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 from fastapi import FastAPI, Path, Query, Request, WebSocket, WebSocketDisconnect
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import HTMLResponse, JSONResponse, Response
 from pydantic import BaseModel, ValidationError
 from pydantic_core import to_json
 
@@ -21,13 +21,16 @@ from services.serving.bodies import (
     Adaptation,
     Described,
     Detailed,
+    Episode,
     Health,
+    Play,
     Question,
     Refusal,
     Step,
     Summary,
 )  # fmt: skip
 from services.serving.guard import Guard
+from services.serving.page import HEADERS, page
 from services.serving.service import Arrays, BusyError, FieldError, Held, MissingError, Service
 
 MOST_UNPACKED = 8
@@ -109,7 +112,9 @@ def _handle_errors(app: FastAPI) -> None:
 
     @app.exception_handler(BusyError)
     def _(request: Request, error: BusyError) -> JSONResponse:
-        return refused(429, "adaptations: got more than this replica takes at once; try again", RETRY_AFTER)
+        return refused(
+            429, "got more adaptations or episodes than a replica takes at once; wanted fewer; try again", RETRY_AFTER
+        )
 
 
 def _problems(errors: list[Any]) -> list[dict[str, Any]]:
@@ -255,6 +260,15 @@ def _add_actions(app: FastAPI, service: Service) -> None:
         answer = dict(zip(Actions.model_fields, (v.tolist() if many else v[0].tolist() for v in values), strict=True))
         return Response(to_json(answer), media_type=JSON)
 
+    @app.post(
+        "/v1/policies/{id}/episodes", response_model=Episode, openapi_extra=_documented(Play),
+        responses=_refusals(404, 410, 422),
+    )  # fmt: skip
+    async def play(id: Id, request: Request) -> JSONResponse:
+        """Let the policy act in an episode of the suite that the model is of, and film it."""
+        episode = await _body(request, Play)
+        return JSONResponse(await service.play(id, episode.task, episode.seed))
+
     @app.websocket("/v1/policies/{id}/control")
     async def control(socket: WebSocket, id: Id) -> None:
         """Answer each observation with an action, and keep the memory of the episode."""
@@ -307,9 +321,13 @@ async def _control(socket: WebSocket, service: Service, name: str, held: Held) -
 
 
 def _add_figures(app: FastAPI, service: Service) -> None:
-    described = service.described
+    content = page()
 
-    @app.get("/healthz", response_model=Health, responses={})
+    @app.get("/", response_class=HTMLResponse, include_in_schema=False)
+    async def root() -> HTMLResponse:
+        return HTMLResponse(content, headers=HEADERS)
+
+    @app.get("/healthz", response_model=Health, openapi_extra={"security": []})
     async def health() -> Health:
         """Answer; needs no token."""
         return Health(model=service.digest)
@@ -317,7 +335,7 @@ def _add_figures(app: FastAPI, service: Service) -> None:
     @app.get("/v1/model", response_model=Described)
     async def model() -> Described:
         """Return what goes into a policy, and what comes out."""
-        return described
+        return service.described
 
     @app.get("/metrics", response_class=Response)
     async def metrics() -> Response:

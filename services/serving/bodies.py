@@ -79,7 +79,20 @@ class Play(Body):
     """An episode of a built-in suite."""
 
     task: Annotated[str, Field(max_length=200)]
-    seed: Annotated[int, Field(strict=True, ge=0, lt=2**31)] = 0
+    seed: Annotated[int, Field(strict=True, ge=0, lt=2**31, description="Its number in an evaluation.")] = 0
+
+
+class Episode(BaseModel):
+    """What came of an episode."""
+
+    success: bool
+    steps: int
+    sub_skills: list[int]
+    """The one that acted at each step."""
+    video: str | None
+    """MP4 in base64."""
+    note: str | None
+    """Why there is no video."""
 
 
 class Summary(BaseModel):

@@ -15,6 +15,7 @@ from starlette.applications import Starlette
 from dmil_core.errors import RunError, UserError
 from dmil_core.model import load
 from services.serving.application import application
+from services.serving.episodes import played
 from services.serving.guard import digest_of
 from services.serving.limits import Limits
 from services.serving.service import Service
@@ -73,8 +74,9 @@ class Replica:
         """Load the model, and listen if the replicas are to."""
         if ray.util.get_node_ip_address() == LOOPBACK:
             _keep_to_loopback()
+        play = ray.remote(played).options(num_cpus=0, max_calls=1).remote  # OpenGL goes with the process
         shelf = cast("Shelf", _RemoteShelf(shelf_of(arguments.limits)))
-        service = Service(load(arguments.model, arguments.runs), shelf, arguments.limits)
+        service = Service(load(arguments.model, arguments.runs), shelf, arguments.limits, play)
         self._application: Any = application(service, arguments.token_digest)
         self._listener: threading.Thread | None = None
         if arguments.port is not None:

@@ -2,13 +2,14 @@
 
 import asyncio
 import contextlib
+import functools
 import hashlib
 import time
 import uuid
 import warnings
 import weakref
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
@@ -25,6 +26,7 @@ from dmil_core.recorded import Interface
 from dmil_core.settings import sub_skills_of
 from services.rollouts.adaptations import imitation_error
 from services.serving.bodies import Described, Detailed
+from services.serving.episodes import played
 from services.serving.limits import Limits
 from services.serving.metrics import Metrics
 from services.serving.packing import packed, unpacked
@@ -93,8 +95,18 @@ class Service:
     observations, is left to threads.
     """
 
-    def __init__(self, model: Model, shelf: Shelf, limits: Limits) -> None:
-        """Begin without a policy."""
+    def __init__(
+        self, model: Model, shelf: Shelf, limits: Limits, play: Callable[..., Awaitable[dict[str, Any]]] | None = None
+    ) -> None:
+        """Begin without a policy.
+
+        Args:
+            model: to adapt.
+            shelf: of all replicas.
+            limits: of the service.
+            play: does what `played` does, in another process; a thread of this one if not given.
+        """
+        self._play = play or functools.partial(asyncio.to_thread, played)
         self.model, self.limits, self.metrics = model, limits, Metrics()
         self.name = uuid.uuid4().hex
         self._shelf = shelf
@@ -108,8 +120,9 @@ class Service:
         self._removals = 0
         self._adaptations = 0
         self._one_at_a_time = asyncio.Lock()
+        self._playing = False
 
-    @property
+    @functools.cached_property
     def described(self) -> Described:
         """The model in words and numbers."""
         config, interface = self.model.checkpoint.manifest.config, self.interface
@@ -309,6 +322,29 @@ class Service:
         if len(rows) <= FEW_ROWS:
             return act(held.policy, rows, memory)
         return await asyncio.to_thread(act, held.policy, rows, memory)
+
+    async def play(self, name: str, task: str, episode: int) -> dict[str, Any]:
+        """Let a policy act in an episode of the suite that the model is of, one at a time in a replica.
+
+        Raises:
+            MissingError: if the policy is not there.
+            FieldError: if the task is not.
+            BusyError: if another episode is played.
+        """
+        found = await self._shelf.get(name)
+        if not isinstance(found, Kept):
+            raise MissingError(name, found)
+        if task not in (tasks := self.described.tasks):
+            wanted = f"one of {', '.join(tasks)}" if tasks else "none: the suite is not installed here"
+            raise FieldError(f"task: got {shorten(task)}; wanted {wanted}", "body", "task")
+        if self._playing:
+            raise BusyError
+        self._playing = True
+        try:
+            config = self.model.checkpoint.manifest.config
+            return await self._play(found.content, config.suite, task, episode, config.seed)
+        finally:
+            self._playing = False
 
     async def figures(self) -> bytes:
         """Return the figures of all replicas in Prometheus' format."""

@@ -266,6 +266,25 @@ def test_figures_are_those_of_all_replicas(replicas: Replicas):
     assert "dmil_serving_policies 1.0" in found
 
 
+def test_a_policy_plays_an_episode_of_the_models_suite(replicas: Replicas, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("MUJOCO_GL", "none")
+    name = replicas.one.post("/v1/policies", json=wrong()).json()["id"]
+    address = f"/v1/policies/{name}/episodes"
+    played = replicas.other.post(address, json={"task": "drawer-close", "seed": 3}).json()
+    assert len(played["sub_skills"]) == played["steps"] > 0
+    assert played["video"] is None
+    assert "MUJOCO_GL: got none" in played["note"]
+    other = replicas.other.post(address, json={"task": "fly"})
+    assert (other.status_code, other.json()["detail"][0]["loc"]) == (422, ["body", "task"])
+
+
+def test_the_page_holds_nothing_and_lets_nothing_else_run(replicas: Replicas):
+    page = TestClient(replicas.one.app).get("/")
+    assert page.status_code == 200
+    assert "default-src 'none'" in page.headers["content-security-policy"]
+    assert replicas.model.checkpoint.digest not in page.text
+
+
 def test_the_model_and_the_token_are_described(replicas: Replicas):
     model = replicas.one.get("/v1/model").json()
     assert (model["obs_dim"], model["action_dim"], model["suite"]) == (39, 4, "ml10")

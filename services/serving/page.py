@@ -1,0 +1,27 @@
+"""The page of the service: one file that holds nothing of the service and asks for all with the token."""
+
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+
+from services.cli.colours import COLOURS
+
+HEADERS = {
+    "content-security-policy": (
+        "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; connect-src 'self'; img-src data:; "
+        "media-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+}
+"""The page runs nothing that comes from elsewhere, and is in no other's frame."""
+
+
+def page() -> str:
+    """Return the page, in the style of a run's."""
+    templates = Environment(
+        loader=ChoiceLoader([PackageLoader("services.serving"), PackageLoader("services.reporting")]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return templates.get_template("service.html").render(colours=COLOURS)
