@@ -12,7 +12,7 @@ from typing import Any, NoReturn, TypeAlias, TypeVar
 from rich.table import Table
 
 from services.cli.arguments import exit_code, parse
-from services.cli.progress import console
+from services.cli.places import announce
 
 Row: TypeAlias = Mapping[str, Any]
 
@@ -33,10 +33,10 @@ def main(run: Callable[[A], Sequence[Row] | Row], defaults: A, description: str 
 
     def program(arguments: Sequence[str]) -> None:
         args = parse(type(defaults), description or "", arguments, defaults)
+        announce(rows=(args.json, "--json FILE"))
         rows = run(args)
         if args.json is not None:
             write_rows(args.json, rows)
-            console.print(f"rows: {args.json}")
 
     sys.exit(exit_code(program, sys.argv[1:]))
 

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from io import BufferedReader, FileIO
 from pathlib import Path, PurePath
+from tempfile import TemporaryFile
 from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -21,8 +22,15 @@ from dmil_core.errors import RunError, UserError, describe_errors, shorten
 
 Model = TypeVar("Model", bound=BaseModel)
 
-FULL = {errno.ENOSPC, errno.EDQUOT}
-FULL_IN_WORDS = ("No space left on device", "Disk quota exceeded", "os error 28", "errno = 28")
+FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+FULL_IN_WORDS = (
+    "No space left on device",
+    "Disk quota exceeded",
+    "os error 28",
+    "errno = 28",
+    "errno = 27",
+    "errno = 122",
+)
 """How libraries that write by themselves say it."""
 
 
@@ -82,10 +90,21 @@ def room_for(path: Path, needed: int) -> Iterator[None]:
     except Exception as error:
         if not _for_want_of_space(error):
             raise
+        limit = ", but a quota or ulimit -f allows less" if free >= needed else ""
         raise DiskFullError(
-            f"{path}: needs {needed} bytes, its disk had {free} free; nothing half-written is kept; make room, then "
-            "start again: a run goes on with --resume"
+            f"{path}: needs {needed} bytes, its disk had {free} free{limit}; nothing half-written is kept; make room, "
+            "then start again: a run goes on with --resume"
         ) from error
+
+
+def reserve(folder: Path, needed: int) -> None:
+    """See whether `needed` bytes can be written in a folder, for a library that does not survive it if they cannot.
+
+    Raises:
+        OSError: if not.
+    """
+    with TemporaryFile(dir=folder) as file:
+        os.posix_fallocate(file.fileno(), 0, needed)
 
 
 def _for_want_of_space(error: Exception) -> bool:

@@ -45,6 +45,8 @@ def announce(**places: tuple[Path | None, str]) -> None:
 def _misplaced(path: Path, how: str) -> str | None:
     """Return why nothing can be written to `path`, which is given by `how`, or None; who only reads there may read."""
     there = next(place for place in (path, *path.parents) if os.path.exists(place))  # noqa: PTH110  Path's may raise
+    if path.is_dir() and how.endswith("FILE"):
+        return "a folder is"
     if not there.is_dir() and (there != path or how.endswith("FOLDER")):
         return f"{there} is no folder"
     return f"{there} cannot be written to" if how.startswith("--") and not os.access(there, os.W_OK) else None

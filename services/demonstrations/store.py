@@ -26,7 +26,7 @@ from dmil_core.checksums import MOST_LISTED, check_listing, write_listing
 from dmil_core.configs import DemonstrationConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError, digest
 from dmil_core.errors import describe_errors
-from dmil_core.files import ForeignFileError, at_home, inside, making_folder, open_file, read_file, room_for
+from dmil_core.files import ForeignFileError, at_home, inside, making_folder, open_file, read_file, reserve, room_for
 from dmil_core.trajectories import Episode
 from services.storage.redaction import error_line
 from services.storage.remote import Storage, given_storage
@@ -181,9 +181,11 @@ class DemoStore:
             "settings": json.dumps(settings),
             "versions": json.dumps({library: version(library) for library in LIBRARIES}),
         }
-        with room_for(path, _bytes_on_disk(successes)):
+        needed = _bytes_on_disk(successes)
+        with room_for(path, needed):
             try:
                 with making_folder(self.root, dataset_id) as made:
+                    reserve(made, needed)  # HDF5 ends the process where a write fails
                     _write(made, successes, metadata)
             except FileExistsError:
                 if not (there := self.load(dataset_id, task)):

@@ -3,12 +3,16 @@
 Ray puts ``ray_`` before each name, and ``_total`` behind that of a counter; docs/operations.md lists them.
 """
 
+import logging
 from typing import Any, Literal, NamedTuple
 
 from services.cli.live_view import Workers
 from services.distributed.adaptation_worker import Block
 from services.distributed.calls import Call, PoolListener
 from services.distributed.timing import Timing
+from services.storage.redaction import error_line
+
+logger = logging.getLogger(__name__)
 
 
 class Measure(NamedTuple):
@@ -78,6 +82,7 @@ class RayMeter(Meter):
 
     def __init__(self, suite: str) -> None:
         """Start all counters that have no labels but the suite."""
+        self._has_failed = False
         self._metrics = {measure: _of_ray(measure, suite) for measure in MEASURES}
         for measure in MEASURES:
             if measure.kind == "counter" and not measure.labels:
@@ -87,15 +92,16 @@ class RayMeter(Meter):
         """Add to a counter, set a gauge, or observe a value of a histogram.
 
         Adding 0 or less to a counter makes it exist without changing it: an alert on its growth needs to see it before
-        it grows.
+        it grows. What Ray raises, whatever it is, is logged once, and the run goes on.
         """
         metric = self._metrics[measure]
-        if measure.kind == "counter":
-            metric.inc(value if value > 0 else NOTHING, labels)
-        elif measure.kind == "gauge":
-            metric.set(value, labels)
-        else:
-            metric.observe(value, labels)
+        record = {"counter": "inc", "gauge": "set", "histogram": "observe"}[measure.kind]
+        try:
+            getattr(metric, record)(value if value > 0 or measure.kind != "counter" else NOTHING, labels)
+        except Exception as error:  # noqa: BLE001  whatever Ray raises
+            if not self._has_failed:
+                logger.warning(f"Ray takes no metrics ({error_line(error)}); going on without")
+            self._has_failed = True
 
     def iteration(self, timing: Timing) -> None:
         """Count an iteration, and the seconds of its phases."""

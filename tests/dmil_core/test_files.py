@@ -33,7 +33,9 @@ def test_a_file_is_written_whole_and_in_place_of_another(tmp_path: Path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("words", ["No space left on device", "I/O error: os error 28", "Can't write (errno = 28)"])
+@pytest.mark.parametrize(
+    "words", ["No space left on device", "I/O error: os error 28", "Can't write (errno = 28)", "(errno = 27, a quota)"]
+)
 def test_a_full_disk_is_reported_with_path_and_bytes(tmp_path: Path, words: str):
     path = tmp_path / "file"
     with (

@@ -56,17 +56,10 @@ PLACES = (
 )
 RUNS = ("runs", "my runs", "r=1,2", "deep/er", "~runs", "x#y")
 ODDITIES = ("",) * 6 + ("arrays", "arrays", "in place", "in place", "nan", "reward", "no success")
-METHODS = (
-    "dmil",
-    "dmil",
-    "behaviour-cloning",
-    "per-task",
-    "nearest-neighbour",
-    "tracking",
-    "option-gail-offline",
-    "mlsh",
-)
+LEARNING = ("dmil", "dmil", "behaviour-cloning", "option-gail-offline", "mlsh")
+METHODS = (*LEARNING, "per-task", "nearest-neighbour")
 DEMOS = "my demos=1.npz"
+DATA = ("",) * 8 + ("sound",) * 4 + ("short", "nan", "cut off")
 MISTAKES = (
     ("--seed", "x"), ("--method", "none"), ("--suite", "none"), ("--training.iterations", "-1"), ("--no-such", "1"),
     ("--evaluation.every", "7"), ("--config", "nowhere.yaml"), ("--demos", "npz:a=nowhere.npz"),
@@ -99,7 +92,7 @@ class Combination:
         self.moment = draw.uniform(0, 1.05)
         self.name = draw.choice(NAMES) if draw.random() < 0.6 else "run"
         self.place, self.runs = draw.choice(PLACES), draw.choice(RUNS)
-        self.oddity, self.demos = draw.choice(ODDITIES), draw.choice(("", "", "", "sound", "short", "nan", "cut off"))
+        self.oddity, self.demos = draw.choice(ODDITIES), draw.choice(DATA)
         self.has_storage = "storage" in self.stroke_name or isinstance(self.stroke, MachineLost) or draw.random() < 0.3
         self.settings = drawn_settings(draw)
 
@@ -138,7 +131,7 @@ class Combination:
 def drawn_settings(draw: Random) -> list[str]:
     """Return flags for a run of a second or so, now and then with a mistake among them."""
     method, every = draw.choice(METHODS), draw.randint(1, 3)
-    iterations = draw.randint(0, 8) if method not in ("nearest-neighbour", "tracking") else 0
+    iterations = draw.randint(0, 8) if method in LEARNING else 0
     settings: dict[str, object] = {
         "method": method, "training.iterations": iterations, "training.checkpoint-every": every,
         "training.checkpoints-kept": draw.randint(1, 3), "training.tasks-per-iteration": draw.randint(1, 4),

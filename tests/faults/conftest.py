@@ -11,7 +11,7 @@ from tests.faults.toy_package import install
 from tests.services import conftest as services
 
 _console, complaint, logged = services._console, services.complaint, services.logged  # fixtures
-mlflow_file, wait_for = services.mlflow_file, services.wait_for_fixture
+mlflow_file, mlflow_server, wait_for = services.mlflow_file, services.mlflow_server, services.wait_for_fixture
 
 TOY = ("--suite", "toy", "--preset", "smoke", "--runner", "local")
 SHORT = (

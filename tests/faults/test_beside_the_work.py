@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import resource
 import shlex
 import signal
 import subprocess
@@ -15,6 +16,7 @@ from dmil_core.files import DiskFullError
 from services import meta_train
 from services.cli import stopping, streams
 from services.cli.arguments import exit_code
+from services.distributed import metrics
 from services.evaluation import evaluator
 from services.experiments import meta_training
 from services.reporting import run_report
@@ -109,6 +111,19 @@ def test_a_page_that_cannot_be_drawn_is_told_and_the_run_ends_well(train, logged
     ]
 
 
+def test_metrics_that_ray_does_not_take_end_nothing(monkeypatch, logged):
+    class Closed:
+        def inc(self, *values: object) -> None:
+            raise OSError("the port is taken")
+
+        set = observe = inc
+
+    monkeypatch.setattr(metrics, "_of_ray", lambda measure, suite: Closed())
+    meter = metrics.RayMeter("toy")
+    meter.record(metrics.CHECKPOINT_TIME, 1.0)
+    assert logged() == ["Ray takes no metrics (OSError: the port is taken); going on without"]
+
+
 @pytest.mark.parametrize(
     ("error", "code"),
     [(KeyboardInterrupt(), 130), (ArithmeticError("a bug"), None), (DiskFullError("elsewhere: full"), 1)],
@@ -134,6 +149,18 @@ def test_whatever_ends_a_run_leaves_its_last_iteration(workplace, monkeypatch, c
     assert ended_as(folder) == ("KILLED" if code == 130 else "FAILED")
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "to go on: " in line]
     assert shlex.split(line.partition("to go on: ")[2]) == ["dmil", "meta-train", "--resume", "runs/a run's"]
+
+
+def test_a_quota_that_demonstrations_do_not_fit_in_is_told(workplace, monkeypatch, capsys):
+    monkeypatch.setenv("DMIL_DATA", "own")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, hard))
+    try:
+        assert exit_code(meta_train.run, [*TOY, *SHORT, "--name", "run"]) == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert "but a quota or ulimit -f allows less" in capsys.readouterr().err
+    assert not list((workplace / "own").rglob("*.hdf5"))
 
 
 @pytest.mark.parametrize("number", stopping.STOPS)

@@ -1,10 +1,15 @@
 """A record that MLflow will never take does not block those behind it."""
 
+import http.server
 import json
 import shlex
 import sqlite3
 import subprocess
 import sys
+import threading
+import urllib.error
+import urllib.request
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -15,6 +20,7 @@ from services.tracking import sending
 from services.tracking.delivery import REFUSED, Delivery, Identity
 from services.tracking.sending import acceptable
 from services.tracking.tracker import Tracker
+from tests.services.conftest import Server
 
 
 @pytest.fixture
@@ -152,3 +158,59 @@ def test_a_database_that_takes_nothing_is_one_line(workplace: Path, mlflow_file:
     assert len(lines) == 2, printed
     assert "does not take records" in lines[0]
     assert "records wait in run/tracking.jsonl" in lines[1]
+
+
+@pytest.mark.thorough
+def test_a_locked_database_is_one_line_too(folder: Path, mlflow_file: str, monkeypatch, capsys):
+    Path("own.db").write_bytes(Path(mlflow_file.removeprefix("sqlite:///")).read_bytes())
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "sqlite:///own.db")
+    with closing(sqlite3.connect("own.db", isolation_level=None)) as lock:
+        lock.execute("begin exclusive")
+        assert not Tracker(folder, "locked").close("FINISHED")
+        lines = capsys.readouterr().out.splitlines()
+    assert 1 <= len(lines) <= 2, lines
+    assert "records wait in" in lines[-1]
+
+
+@pytest.mark.thorough
+def test_what_an_older_server_lacks_is_left_out(folder: Path, mlflow_server: Server, monkeypatch, logged):
+    class Older(http.server.BaseHTTPRequestHandler):
+        """Passes everything on but a call that came with a later version."""
+
+        def do_POST(self) -> None:
+            content = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+            request = urllib.request.Request(
+                f"{mlflow_server.uri}{self.path}",
+                content or None,
+                {"Content-Type": "application/json"},
+                method=self.command,
+            )
+            try:
+                with urllib.request.urlopen(request) as answer:
+                    status, body = answer.status, answer.read()
+            except urllib.error.HTTPError as error:
+                status, body = error.code, error.read()
+            if self.path.endswith("log-inputs"):
+                status, body = 404, b"<title>404 Not Found</title>"
+            self.send_response(status)
+            self.send_header("Content-Type", "application/json")
+            self.end_headers()
+            self.wfile.write(body)
+
+        do_GET = do_POST  # noqa: N815
+
+        def log_message(self, *arguments: object) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Older) as older:
+        threading.Thread(target=older.serve_forever, daemon=True).start()
+        monkeypatch.setenv("MLFLOW_TRACKING_URI", f"http://127.0.0.1:{older.server_port}")
+        tracker = Tracker(folder, "older")
+        tracker.inputs({"toy": "0" * 64})
+        tracker.metrics(1, {"loss": 0.5})
+        assert tracker.close("FINISHED")
+        older.shutdown()
+    run = MlflowClient(mlflow_server.uri).get_run(str(tracker.run_id))
+    assert (run.info.status, run.data.metrics) == ("FINISHED", {"loss": 0.5})
+    (line,) = [line for line in logged() if "for good" in line]
+    assert "inputs" in line

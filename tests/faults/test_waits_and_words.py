@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks import harness
 from dmil_core.errors import UserError
 from services import evaluate, inspect_demos, meta_train
 from services.cli.arguments import exit_code
@@ -35,6 +36,21 @@ def test_what_cannot_be_written_is_refused_and_what_is_only_read_may_be_read(tmp
     announce(demonstrations=(tmp_path, "DMIL_DATA=FOLDER"), MLflow=(tmp_path / "m.db", "MLFLOW_TRACKING_URI=…"))
     with pytest.raises(UserError, match="cannot be written to; wanted a place for it: --runs FOLDER"):
         announce(run=(tmp_path / "run", "--runs FOLDER"))
+
+
+@pytest.mark.parametrize("place", ["folder", "file/below", "read-only/rows.json"])
+def test_rows_that_cannot_be_written_are_refused_before_anything_is_measured(
+    workplace, monkeypatch, capsys, place: str
+):
+    Path("folder").mkdir()
+    Path("file").touch()
+    if place.startswith("read-only"):
+        monkeypatch.setattr(os, "access", lambda path, mode: False)  # as for who is not root
+    monkeypatch.setattr(sys, "argv", ["benchmark", "--json", place])
+    with pytest.raises(SystemExit) as end:
+        harness.main(lambda arguments: pytest.fail("measured"), harness.BenchmarkArguments(), "")
+    assert end.value.code == 2
+    assert "wanted a place for it: --json FILE" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
