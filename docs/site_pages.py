@@ -1,4 +1,4 @@
-"""What `make docs` does to pages on their way to the site: those of the repository's root, equations, the notebook."""
+"""What `make docs` does to pages on their way to the site: those outside docs/, equations, the notebook."""
 
 import json
 import re
@@ -9,13 +9,16 @@ from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 
 PROJECT = Path(__file__).parents[1]
-ROOT_PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "CONTRIBUTING.md", "CHANGELOG.md": "CHANGELOG.md"}
+ROOT_PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "CONTRIBUTING.md", "CHANGELOG.md": "CHANGELOG.md"} | {
+    f"models/{card.parent.name}/README.md": f"models/{card.parent.name}.md"
+    for card in (PROJECT / "models").glob("*/README.md")
+}
 EQUATION = re.compile(r"^```math\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 NOTEBOOK = "first_run"
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add the pages of the repository's root, the licence, and the notebook as a page."""
+    """Add the pages outside docs/, the licence, and the notebook as a page."""
     for name, place in ROOT_PAGES.items():
         text = (PROJECT / name).read_text("utf-8").replace("](docs/", "](")
         files.append(File.generated(config, place, content=text))

@@ -108,7 +108,7 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [*PAGES, *PROJECT.glob("models/*/README.md")], ids=lambda page: page.name)
 def test_every_command_line_of_a_page_is_taken(page: Path, workplace: Path):
     wrong = []
     for block in blocks(page, "bash|sh"):
