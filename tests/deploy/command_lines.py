@@ -19,6 +19,7 @@ from dmil_core.errors import UserError
 from services import report, tune_sweep
 from services.cli.arguments import PROGRAMS as PROGRAMS_OF_DMIL
 from services.cli.arguments import parse
+from services.suites.registry import open_suite
 from tests.deploy.manifests import DEPLOY, ask
 
 PROGRAMS = {"ray", "mlflow", "python", "weed", "prometheus", "pg_isready", "wget"}
@@ -82,7 +83,10 @@ class _ReadError(BaseException):
 
 
 def _read_only(*arguments: Any) -> NoReturn:
-    raise _ReadError(parse(*arguments))
+    read = parse(*arguments)
+    if experiment := getattr(read, "experiment", None):
+        open_suite(experiment.suite)
+    raise _ReadError(read)
 
 
 def _refused_by_module(module: str, flags: Sequence[str]) -> str | None:
