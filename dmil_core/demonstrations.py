@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -38,23 +38,26 @@ class Demonstration(Trajectory, _Named):  # bases in this order: a constructor t
             finite. A single step can be learned from: it has no continuity, and counts in every other loss.
     """
 
+    cut_from: "tuple[Demonstration, int] | None" = field(default=None, init=False, repr=False)
+    """What it is a window of, and from which step on."""
+
     def __post_init__(self) -> None:
-        for field in ("observations", "actions"):
-            values = getattr(self, field)
+        for name in ("observations", "actions"):
+            values = getattr(self, name)
             if values.ndim != 2 or values.shape[0] == 0 or values.shape[1] == 0:
                 raise DemonstrationError(
-                    f"demonstration {self.id} of {self.task}: {field} has the shape {values.shape}; "
+                    f"demonstration {self.id} of {self.task}: {name} has the shape {values.shape}; "
                     "wanted (steps, dimensions) with at least one of each; drop the demonstration"
                 )
             if values.dtype != np.float32:
                 raise DemonstrationError(
-                    f"demonstration {self.id} of {self.task}: {field} has numbers of the type {values.dtype}; wanted "
+                    f"demonstration {self.id} of {self.task}: {name} has numbers of the type {values.dtype}; wanted "
                     "float32; convert them"
                 )
             if not np.isfinite(values).all():
                 step = int(np.argwhere(~np.isfinite(values).all(axis=1))[0, 0])
                 raise DemonstrationError(
-                    f"demonstration {self.id} of {self.task}: {field} at step {step} is not finite; "
+                    f"demonstration {self.id} of {self.task}: {name} at step {step} is not finite; "
                     "wanted real numbers only; drop the demonstration or mend the step"
                 )
         if len(self.observations) != len(self.actions):
@@ -72,12 +75,14 @@ class Demonstration(Trajectory, _Named):  # bases in this order: a constructor t
         if not 0 <= start <= start + steps <= len(self):
             raise IndexError(f"window: got {steps} steps from {start} of {len(self)}; wanted a part of them")
         cut = slice(start, start + steps)
-        return dataclasses.replace(
+        window = dataclasses.replace(
             self,
             id=f"{self.id}[{start}:{start + steps}]",
             observations=self.observations[cut],
             actions=self.actions[cut],
         )
+        object.__setattr__(window, "cut_from", (self, start))
+        return window
 
 
 class PathBatch(NamedTuple):

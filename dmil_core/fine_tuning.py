@@ -35,7 +35,8 @@ def on_batches(networks: Sequence[Network], loss: Callable[[Steps], Tensor], ste
     generator = torch.Generator().manual_seed(0)
     for step in range(tuning.steps):
         adam.learning_rate = cosine_rate(tuning.learning_rate, step / tuning.steps)
-        drawn: Int[Tensor, " batch"] = torch.randint(len(steps.states), (BATCH,), generator=generator)
+        drawn: Int[Tensor, " batch"] = torch.randint(len(steps.states), (BATCH,), generator=generator, device="cpu")
+        drawn = drawn.to(steps.states.device)
         descend(adam, loss(Steps(steps.states[drawn], steps.actions[drawn], torch.ones(BATCH, dtype=torch.int64))))
 
 

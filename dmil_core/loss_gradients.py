@@ -4,6 +4,9 @@ Automatic differentiation twice through an inner loop keeps every intermediate o
 and reads it again to take the step. A perceptron is simple enough to do without: a layer's weight gradient is the
 product δᵀx of what came back and what went in, and a product can be subtracted from a weight while it is computed.
 Neither the networks nor their inputs may ask autograd for a gradient.
+
+All of it also computes several networks at once: every tensor then has a first axis for them, the losses' values too,
+and each product is one product of stacks of matrices.
 """
 
 from collections.abc import Callable
@@ -14,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dmil_core.losses import OutputLoss
-from dmil_core.networks import Layer, Network, activations, blocks
+from dmil_core.networks import Layer, Network, activations, add_product, affine, blocks
 
 _relu_backward = torch.ops.aten.threshold_backward.grad_input
 
@@ -23,19 +26,19 @@ class LossGradient(NamedTuple):
     """Loss of a network at given parameters: the value, the gradient in factors, and the Hessian."""
 
     network: Network
-    inputs: list[list[Float[Tensor, "block _"]]]
+    inputs: list[list[Float[Tensor, "*networks block _"]]]
     """For each block of steps, what went into each layer, x_l."""
-    deltas: list[list[Float[Tensor, "block _"]]]
+    deltas: list[list[Float[Tensor, "*networks block _"]]]
     """The loss's gradient with respect to what each layer put out before its ReLU, δ_l: ∇W_l = Σ δ_lᵀ x_l."""
-    outputs: Float[Tensor, "steps outputs"]
+    outputs: Float[Tensor, "*networks steps outputs"]
     loss: OutputLoss
 
     def add_to(self, vector: Network, scale: float = 1.0) -> None:
         """Add `scale` times the gradient to `vector`, in place."""
         for inputs, deltas in zip(self.inputs, self.deltas, strict=True):
             for (weight, bias), value, delta in zip(vector, inputs, deltas, strict=True):
-                weight.addmm_(delta.mT, value, alpha=scale)
-                bias.add_(delta.sum(0), alpha=scale)
+                add_product(weight, delta.mT, value, scale)
+                bias.add_(delta.sum(-2), alpha=scale)
 
     def descend(self, learning_rate: float, *, in_place: bool = False) -> Network:
         """Return the network after one step of gradient descent; with `in_place`, `self.network` is overwritten."""
@@ -51,32 +54,33 @@ class LossGradient(NamedTuple):
         ReLU's mask, then R{∇W_l} = R{δ_l}ᵀ x_l + δ_lᵀ R{x_l}: six products a layer.
         """
         tangents = [_tangents(self.network, vector, inputs) for inputs in self.inputs]
-        changes = blocks(self.loss.curvature(torch.cat([block.pop() for block in tangents])))
+        changes = blocks(self.loss.curvature(torch.cat([block.pop() for block in tangents], -2)))
         for index in reversed(range(len(vector))):
             steps = list(zip(changes, self.inputs, self.deltas, tangents, strict=True))
             if index:
                 changes = [
                     _masked(
-                        (change @ self.network[index].weight).addmm_(deltas[index], vector[index].weight), inputs[index]
+                        add_product(change @ self.network[index].weight, deltas[index], vector[index].weight),
+                        inputs[index],
                     )
                     for change, inputs, deltas, _ in steps
                 ]
             weight, bias = vector[index]
             for change, inputs, deltas, tangent in steps:
-                weight.addmm_(change.mT, inputs[index], alpha=-learning_rate)
-                bias.sub_(change.sum(0), alpha=learning_rate)
+                add_product(weight, change.mT, inputs[index], -learning_rate)
+                bias.sub_(change.sum(-2), alpha=learning_rate)
                 if index:
-                    weight.addmm_(deltas[index].mT, tangent[index - 1], alpha=-learning_rate)
+                    add_product(weight, deltas[index].mT, tangent[index - 1], -learning_rate)
 
 
 def loss_gradient(
     network: Network,
-    inputs: Float[Tensor, "steps inputs"],
-    loss: Callable[[Float[Tensor, "steps outputs"]], OutputLoss],
+    inputs: Float[Tensor, "*networks steps inputs"],
+    loss: Callable[[Float[Tensor, "*networks steps outputs"]], OutputLoss],
 ) -> LossGradient:
     """Return a network's loss and its gradient: one forward and one backward pass."""
     values = [activations(network, block) for block in blocks(inputs)]
-    outputs = torch.cat([block.pop() for block in values])
+    outputs = torch.cat([block.pop() for block in values], -2)
     at_outputs = loss(outputs)
     deltas = [
         _deltas(network, block, gradient) for block, gradient in zip(values, blocks(at_outputs.gradient), strict=True)
@@ -95,10 +99,10 @@ def _deltas(network: Network, inputs: list[Tensor], gradient: Tensor) -> list[Te
 def _tangents(network: Network, vector: Network, inputs: list[Tensor]) -> list[Tensor]:
     """Return the derivative along `vector` of what each layer puts out, R{x_{l+1}}, and last R{z_L}."""
     tangents: list[Tensor] = []
-    for index, ((weight, _), (along, along_bias)) in enumerate(zip(network, vector, strict=True)):
-        tangent = torch.mm(inputs[index], along.mT).add_(along_bias)
+    for index, ((weight, _), along) in enumerate(zip(network, vector, strict=True)):
+        tangent = affine(along, inputs[index])
         if index:
-            tangent.addmm_(tangents[-1], weight.mT)
+            add_product(tangent, tangents[-1], weight.mT)
         tangents.append(_masked(tangent, inputs[index + 1]) if index + 1 < len(network) else tangent)
     return tangents
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -21,19 +22,44 @@ class Steps(NamedTuple):
 
     @classmethod
     def of(cls, demonstrations: Sequence[Demonstration], normalise: Normalisation) -> "Steps":
-        """Copy demonstrations into fresh tensors: what a worker receives is shared memory and stays untouched."""
+        """Copy demonstrations into fresh tensors: what a worker receives is shared memory and stays untouched.
+
+        On a GPU, torch's default device then, each whole demonstration is copied once and stays there.
+        """
+        device = torch.get_default_device()
+        if device.type != "cpu":
+            states, actions = zip(*(_resident(one, normalise, device) for one in demonstrations), strict=True)
+            return cls(torch.cat(states), torch.cat(actions), torch.tensor([len(one) for one in demonstrations]))
         observations = np.concatenate([demonstration.observations for demonstration in demonstrations])
         actions = np.concatenate([demonstration.actions for demonstration in demonstrations])
         lengths = [len(demonstration) for demonstration in demonstrations]
         return cls(torch.from_numpy(normalise(observations)), torch.from_numpy(actions), torch.tensor(lengths))
 
 
-class OutputLoss(NamedTuple):
-    """A loss as a function of a network's outputs, at one point."""
+_RESIDENTS: WeakKeyDictionary[Demonstration, tuple[Normalisation, Tensor, Tensor]] = WeakKeyDictionary()
+"""States and actions of whole demonstrations on a GPU, for as long as the demonstrations are."""
 
-    value: Float[Tensor, ""]
-    gradient: Float[Tensor, "steps outputs"]
-    curvature: Callable[[Float[Tensor, "steps outputs"]], Float[Tensor, "steps outputs"]]
+
+def _resident(
+    one: Demonstration, normalise: Normalisation, device: torch.device
+) -> tuple[Float[Tensor, "steps obs_dim"], Float[Tensor, "steps action_dim"]]:
+    """Return a demonstration's states and actions on a device; those of a window are a part of the whole one's."""
+    whole, start = one.cut_from or (one, 0)
+    kept = _RESIDENTS.get(whole)
+    if kept is None or kept[0] is not normalise or kept[1].device.type != device.type:
+        states, actions = (
+            torch.tensor(values, device=device) for values in (normalise(whole.observations), whole.actions)
+        )
+        kept = _RESIDENTS[whole] = normalise, states, actions
+    return kept[1][start : start + len(one)], kept[2][start : start + len(one)]
+
+
+class OutputLoss(NamedTuple):
+    """A loss as a function of a network's outputs, at one point; or that of each of several networks."""
+
+    value: Float[Tensor, "*networks"]
+    gradient: Float[Tensor, "*networks steps outputs"]
+    curvature: Callable[[Float[Tensor, "*networks steps outputs"]], Float[Tensor, "*networks steps outputs"]]
     """Multiplies by the Hessian."""
 
     def plus(self, other: "OutputLoss", weight: float) -> "OutputLoss":
@@ -46,19 +72,20 @@ class OutputLoss(NamedTuple):
 
 
 def differentiated(
-    loss: Callable[[Float[Tensor, "steps outputs"]], Float[Tensor, ""]], outputs: Float[Tensor, "steps outputs"]
+    loss: Callable[[Float[Tensor, "*networks steps outputs"]], Float[Tensor, "*networks"]],
+    outputs: Float[Tensor, "*networks steps outputs"],
 ) -> OutputLoss:
-    """Differentiate a loss automatically."""
+    """Differentiate a loss automatically; that of one of several networks depends on its own outputs alone."""
     at = outputs.detach().requires_grad_()
 
     @torch.enable_grad()
     def curvature(direction: Tensor) -> Tensor:
-        (gradient,) = torch.autograd.grad(loss(at), at, create_graph=True)
+        (gradient,) = torch.autograd.grad(loss(at).sum(), at, create_graph=True)
         return torch.autograd.grad(gradient, at, direction)[0]
 
     with torch.enable_grad():
         value = loss(at)
-    (gradient,) = torch.autograd.grad(value, at)
+    (gradient,) = torch.autograd.grad(value.sum(), at)
     return OutputLoss(value.detach(), gradient, curvature)
 
 

@@ -12,6 +12,7 @@ from dmil_core.adapted_policy import AdaptedPolicy, Origin
 from dmil_core.checkpoint import FOLDER, MANIFEST, Checkpoint, Manifest, Range, opened
 from dmil_core.configs import ExperimentConfig, SuiteConfig, TrainingConfig
 from dmil_core.demonstrations import Demonstration
+from dmil_core.devices import CPU, adapted_on, device_of
 from dmil_core.errors import RunError, UserError, nearest, shorten
 from dmil_core.files import at_home
 from dmil_core.methods.base import FineTuning, Policy
@@ -40,9 +41,13 @@ class DivergedError(RunError):
 class Model:
     """A checkpoint, ready to adapt. It never changes: each `adapt` begins from the same parameters."""
 
-    def __init__(self, checkpoint: Checkpoint) -> None:
-        """Take a checkpoint that was read."""
-        self.checkpoint = checkpoint
+    def __init__(self, checkpoint: Checkpoint, device: str = "cpu") -> None:
+        """Take a checkpoint that was read, and where to adapt.
+
+        Raises:
+            UserError: for a device that there is not.
+        """
+        self.checkpoint, self._device = checkpoint, device_of(device)
         self._parameters = checkpoint.tensors()
 
     @property
@@ -82,9 +87,11 @@ class Model:
         interface = Interface.of(manifest, method)
         support = as_demonstrations(demonstrations, interface)
         _warn(support, interface)
-        policy = method.adapt(self._parameters, support, fine_tuning)
+        device = self._device if method.on_gpu else CPU
+        policy = adapted_on(device, method, self._parameters, support, fine_tuning)
         if (error := _error(policy, support)) > _width(support, actions):
-            before = _error(method.adapt(self._parameters, support, fine_tuning._replace(steps=0)), support)
+            without = fine_tuning._replace(steps=0)
+            before = _error(adapted_on(device, method, self._parameters, support, without), support)
             if error > before or not np.isfinite(error):
                 raise DivergedError(
                     f"adaptation diverged: got a mean squared error of {error:.3g} on what was demonstrated after "
@@ -129,7 +136,7 @@ def track(demonstrations: Sequence[Any], points: Points, *, low: float = -1.0, h
     return AdaptedPolicy(policy, Origin(manifest, method.constants(), support, fine_tuning, interface))
 
 
-def load(name: str | Path, runs: str | Path = "runs") -> Model:
+def load(name: str | Path, runs: str | Path = "runs", device: str = "cpu") -> Model:
     """Return a model.
 
     Args:
@@ -137,14 +144,16 @@ def load(name: str | Path, runs: str | Path = "runs") -> Model:
             `runs`; the name of a model that comes with the project, as ml10; or an address as MLflow's
             ``models:/ml10@champion``. The first of these that there is counts.
         runs: the folder that runs' own folders are in.
+        device: where it adapts: cpu, or a GPU as cuda or cuda:N; its policies act on the CPU.
 
     Raises:
-        UserError: if there is none, or it is damaged.
+        UserError: if there is none, or it is damaged, or there is no such device.
     """
     scheme, colon, _ = str(name).partition(":/")
     if colon and not Path(name).exists():
-        return Model(_fetched(scheme, str(name)))
-    return Model(opened(model_folder(name, runs), lambda damaged: warnings.warn(damaged, stacklevel=4)))
+        return Model(_fetched(scheme, str(name)), device)
+    folder = model_folder(name, runs)
+    return Model(opened(folder, lambda damaged: warnings.warn(damaged, stacklevel=4)), device)
 
 
 def model_folder(name: str | Path, runs: str | Path = "runs", field: str = "name") -> Path:

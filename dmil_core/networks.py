@@ -74,22 +74,42 @@ BLOCK = 320
 """Steps that go through all layers together: so few that what they leave behind stays in a core's own cache."""
 
 
-def activations(network: Network, inputs: Float[Tensor, "steps inputs"]) -> list[Float[Tensor, "steps _"]]:
+def affine(layer: Layer, inputs: Float[Tensor, "*networks steps inputs"]) -> Float[Tensor, "*networks steps outputs"]:
+    """Return what a layer puts out, or the same layer of several networks for the steps of each."""
+    weight, bias = layer
+    if inputs.ndim == 2:
+        return torch.mm(inputs, weight.mT).add_(bias)
+    return torch.baddbmm(bias[:, None], inputs, weight.mT)
+
+
+def add_product(
+    matrix: Float[Tensor, "*networks rows columns"],
+    left: Float[Tensor, "*networks rows _"],
+    right: Float[Tensor, "*networks _ columns"],
+    scale: float = 1.0,
+) -> Float[Tensor, "*networks rows columns"]:
+    """Add `scale` times a product to a matrix in place, or to that of each of several networks, and return it."""
+    add = Tensor.addmm_ if matrix.ndim == 2 else Tensor.baddbmm_
+    return add(matrix, left, right, alpha=scale)
+
+
+def activations(
+    network: Network, inputs: Float[Tensor, "*networks steps inputs"]
+) -> list[Float[Tensor, "*networks steps _"]]:
     """Return what goes into each layer, and last what the network puts out."""
     values = [inputs]
-    for weight, bias in network[:-1]:
-        values.append(torch.mm(values[-1], weight.mT).add_(bias).relu_())
-    weight, bias = network[-1]
-    return [*values, torch.mm(values[-1], weight.mT).add_(bias)]
+    for layer in network[:-1]:
+        values.append(affine(layer, values[-1]).relu_())
+    return [*values, affine(network[-1], values[-1])]
 
 
-def blocks(values: Float[Tensor, "steps _"]) -> Sequence[Float[Tensor, "block _"]]:
-    """Return views of so many steps at a time as go through all layers together."""
-    return (values,) if len(values) <= BLOCK else values.split(BLOCK)
+def blocks(values: Float[Tensor, "*networks steps _"]) -> Sequence[Float[Tensor, "*networks block _"]]:
+    """Return views of so many steps at a time as go through all layers together; those of several networks stay one."""
+    return (values,) if values.ndim == 3 or len(values) <= BLOCK else values.split(BLOCK)
 
 
-def mlp(network: Network, inputs: Float[Tensor, "steps inputs"]) -> Float[Tensor, "steps outputs"]:
-    """Return what the network puts out."""
+def mlp(network: Network, inputs: Float[Tensor, "*networks steps inputs"]) -> Float[Tensor, "*networks steps outputs"]:
+    """Return what the network puts out, or what each of a stack of networks does for its own steps."""
     first, *others = (activations(network, block)[-1] for block in blocks(inputs))
     return torch.cat([first, *others]) if others else first
 
@@ -113,6 +133,11 @@ def routed(
     return torch.cat([mlp(networks[k], states[indices[k]]) for k in used])[torch.cat(indices).argsort()]
 
 
+def on_default_device(values: np.ndarray) -> Tensor:
+    """Return an array as a tensor on torch's default device: on the CPU without a copy."""
+    return torch.from_numpy(values).to(torch.get_default_device())
+
+
 def leaves(parameters: Parameters, *, copy: bool = False) -> dict[str, Tensor]:
     """Return the parameters as leaves of a new graph; a copy may be changed in place."""
     detached = {name: tensor.detach() for name, tensor in parameters.items()}
@@ -133,7 +158,7 @@ class Adam:
     def __init__(self, parameters: Iterable[Tensor], learning_rate: float, weight_decay: float = 0.0) -> None:
         """Begin with moments of zero."""
         self.parameters = list(parameters)
-        self.steps = [torch.tensor(0.0) for _ in self.parameters]
+        self.steps = [torch.tensor(0.0, device=tensor.device) for tensor in self.parameters]
         self.first_moments = [torch.zeros_like(tensor) for tensor in self.parameters]
         self.second_moments = [torch.zeros_like(tensor) for tensor in self.parameters]
         self.learning_rate, self._weight_decay = learning_rate, weight_decay
@@ -206,5 +231,5 @@ def unflatten(vector: Float[Tensor, " size"], like: Mapping[str, torch.Size]) ->
 def zeros_like(parameters: Parameters) -> tuple[Float[Tensor, " size"], Parameters]:
     """Return a flat vector of zeros, and views into it with the parameters' names and shapes."""
     first = next(iter(parameters.values()))
-    vector = torch.zeros(sum(tensor.numel() for tensor in parameters.values()), dtype=first.dtype)
+    vector = first.new_zeros(sum(tensor.numel() for tensor in parameters.values()))
     return vector, unflatten(vector, {name: tensor.shape for name, tensor in parameters.items()})

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration
+from dmil_core.devices import CPU, computing_on
 from dmil_core.errors import as_work_error
 from dmil_core.methods.base import MetaLearner, OnlineMetaLearner, Policy, TaskGradient
 from dmil_core.networks import Adam, Parameters, cosine_rate
@@ -106,39 +107,52 @@ def group_gradient(
     tasks: Sequence[str],
     slots: Sequence[int],
     collect_rollouts: CollectRollouts | None = None,
+    *,
+    batched: bool = False,
 ) -> GroupGradient:
     """Return the summed outer gradient of some slots of an iteration: a pure function of its arguments.
 
     Args:
         method: what learns.
         demonstrations: the training demonstrations of each meta-training task.
-        parameters: θ at the start of the iteration.
+        parameters: θ at the start of the iteration; they are on the device that computes.
         seed: of the experiment.
         iteration: counts from 0.
         tasks: the task of every slot of the iteration, see `tasks_of`.
         slots: which of them to compute.
         collect_rollouts: lets a policy act in a task's environments, for a `OnlineMetaLearner`.
+        batched: compute all slots at once, see `MetaLearner.task_gradients`.
 
     Raises:
         WorkError: for a Python error in one of them, which is named.
     """
-    terms, metrics, nonfinite = [], [], []
+    device = next(iter(parameters.values())).device
+    batches, results, nonfinite = [], [], []
     for slot in slots:
         task = tasks[slot]
-        with as_work_error(slot_label(iteration, slot, task, seed), iteration=iteration, slot=slot):
+        with (
+            as_work_error(slot_label(iteration, slot, task, seed), iteration=iteration, slot=slot),
+            computing_on(device),
+        ):
             batch = method.sample(demonstrations[task], iteration, named_rng(seed, "batch", iteration, slot))
             if isinstance(method, OnlineMetaLearner) and (steps := method.environment_steps(iteration)):
                 assert collect_rollouts is not None
                 policy = method.exploration_policy(parameters, batch)
                 rollouts = collect_rollouts(policy, task, named_seed(seed, "practice", iteration, slot), steps)
                 batch = method.with_rollouts(batch, rollouts)
-            result = method.task_gradient(parameters, batch)
+            batches.append(batch)
+            if not batched:
+                results.append(method.task_gradient(parameters, batch))
+    if batched:
+        label = f"iteration {iteration + 1}, slots {', '.join(map(str, slots))} at once, seed {seed}"
+        with as_work_error(label, iteration=iteration, slot=slots[0]), computing_on(device):
+            results = method.task_gradients(parameters, batches)
+    for slot, batch, result in zip(slots, batches, results, strict=True):
         if not _finite(result):
-            nonfinite.append(NonfiniteSlot(slot, task, tuple(batch.ids)))
-        terms.append(result.gradient)
-        metrics.append(result.metrics)
+            nonfinite.append(NonfiniteSlot(slot, tasks[slot], tuple(batch.ids)))
+    terms = [result.gradient for result in results]
     gradient = torch.full_like(terms[0], torch.nan) if nonfinite else tree_sum(terms)
-    return GroupGradient(gradient.numpy(), metrics, nonfinite)
+    return GroupGradient(gradient.cpu().numpy(), [result.metrics for result in results], nonfinite)
 
 
 def slot_label(iteration: int, slot: int, task: str, seed: int) -> str:
@@ -159,14 +173,17 @@ class OuterStep:
     leaves Adam's moments as they are.
     """
 
-    def __init__(self, state: OuterState, training: TrainingConfig) -> None:
-        """Continue from `state`; a fresh start is `OuterState.start`."""
-        self._training = training
-        self._parameters = torch.nn.Parameter(torch.tensor(state.parameters))
+    def __init__(self, state: OuterState, training: TrainingConfig, device: torch.device = CPU) -> None:
+        """Continue from `state`, on a device; a fresh start is `OuterState.start`."""
+        self._training, self._device = training, device
+
+        def there(values: float | np.ndarray) -> Tensor:
+            return torch.tensor(values, device=device)
+
+        self._parameters = torch.nn.Parameter(there(state.parameters))
         self._adam = Adam([self._parameters], training.learning_rate)
-        self._adam.steps = [torch.tensor(float(state.iteration))]
-        self._adam.first_moments = [torch.tensor(state.first_moment)]
-        self._adam.second_moments = [torch.tensor(state.second_moment)]
+        self._adam.steps = [there(float(state.iteration))]
+        self._adam.first_moments, self._adam.second_moments = [there(state.first_moment)], [there(state.second_moment)]
 
     @property
     def parameters(self) -> Float[Tensor, " size"]:
@@ -178,7 +195,7 @@ class OuterStep:
 
         Where that is not finite, nothing changes.
         """
-        training, total = self._training, torch.tensor(gradient)
+        training, total = self._training, torch.tensor(gradient, device=self._device)
         if training.outer_step == "average":
             total /= training.tasks_per_iteration
         self._parameters.grad = total
@@ -209,5 +226,5 @@ class OuterStep:
     def state(self) -> OuterState:
         """A copy of everything that the next step depends on."""
         (step,), first, second = self._adam.steps, self._adam.first_moments, self._adam.second_moments
-        moments = (moment.numpy().copy() for (moment,) in (first, second))
-        return OuterState(int(step), self.parameters.numpy().copy(), *moments)
+        moments = (moment.cpu().numpy().copy() for (moment,) in (first, second))
+        return OuterState(int(step), self.parameters.cpu().numpy().copy(), *moments)

@@ -49,6 +49,8 @@ class Arguments:
     """Gradient steps of adaptation, in place of those that the demonstration left out chooses."""
     learning_rate: float | None = None
     """Learning rate of adaptation; the run's own if not given."""
+    device: str = "cpu"
+    """Where it is adapted: cpu, or a GPU as cuda or cuda:N; the policy acts on the CPU."""
     suite: str | None = None
     """Also let the policy act in a task of this suite, and measure its success rate."""
     task: str | None = None
@@ -69,7 +71,7 @@ def run(arguments: Sequence[str]) -> None:
     if args.episodes < 1:
         raise UserError(f"--episodes: got {args.episodes}; wanted at least 1")
     suite = None if args.suite is None else open_suite(suite_settings(args.suite, (str(args.task),)))
-    model = load(args.model, args.runs)
+    model = load(args.model, args.runs, args.device)
     recorded = _recorded(args.demos, suite)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UnlikeTrainingWarning)

@@ -20,8 +20,10 @@ import tyro
 
 from dmil_core.checkpoint import FOLDER, Checkpoint, opened
 from dmil_core.configs import EvaluationConfig, ExperimentConfig
+from dmil_core.devices import Compute
 from dmil_core.errors import RunError, UserError
 from dmil_core.files import at_home, inside, write_file
+from dmil_core.methods.registry import method_type
 from dmil_core.model import model_folder
 from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import checked, with_evaluation
@@ -29,7 +31,7 @@ from services.cli.places import announce
 from services.cli.progress import Clock, aside, console
 from services.demonstrations.external import places_of
 from services.demonstrations.store import DATA, open_store
-from services.distributed.ray_runner import RunnerKind, open_runner
+from services.distributed.ray_runner import RunnerKind, check_compute, open_runner
 from services.evaluation.expectation import expected_rows, verdicts
 from services.evaluation.summary import Summary, summarise
 from services.experiments.champions import ALIAS, open_promotion
@@ -69,6 +71,12 @@ class Arguments:
     """Where to work: in Ray actors, or in this process; the result is the same."""
     workers: int | None = None
     """Ray workers, one for each CPU of the cluster if not given."""
+    device: str = "auto"
+    """What adapts, while policies act on the CPU: cpu; cuda, a GPU, or cuda:N with --runner local; auto takes the GPU
+    that Ray gave a worker, see --gpus, else the CPU."""
+    gpus: float | None = None
+    """GPUs that Ray reserves for each worker, up to 1; as many workers share one. If not given: none, or with --device
+    cuda an equal part of all."""
     promote: bool = False
     """Register the run's model in MLflow under the suite's name, and give it the alias champion if it is the first, or
     better than the champion outside the interval of their difference: the champion is then evaluated too, in the same
@@ -98,6 +106,7 @@ def run(arguments: Sequence[str]) -> None:
     assert checkpoint is not None, "without --checkpoint there is nothing that parses"
     tasks = args.tasks if args.tasks is not None or early.demos is None else tuple(places_of(early.demos))
     config = _config(checkpoint, args, tasks, early.demos)
+    check_compute(args.runner, Compute(args.device), method_type(config.method.name), args.gpus)
     experiment = Experiment(config, store := open_store())
     only = experiment.suite.test_tasks if args.expect else tasks
     experiment.read_sources(only)
@@ -167,7 +176,7 @@ def _carry_out(
     try:
         record_settings(tracker, experiment.config)
         tracker.tags({"evaluation_of": str(checkpoint.path)})
-        with open_runner(args.runner, experiment.suite, args.workers) as runner:
+        with open_runner(args.runner, experiment.suite, args.workers, Compute(args.device), args.gpus) as runner:
             clock.lap("start")
             data = experiment.collect(runner, only)
             tracker.inputs({dataset.id: dataset.digest for dataset in data.values()})

@@ -15,14 +15,16 @@ import tyro
 from pydantic import ValidationError
 
 from dmil_core.configs import DEFAULT_METHOD, ExperimentConfig
+from dmil_core.devices import Compute, GradientPath
 from dmil_core.errors import UserError, describe_errors
 from dmil_core.files import check_folder, inside, read_file, write_file
+from dmil_core.methods.registry import method_type
 from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import DEFAULT_PRESET, EARLY, defaults_from
 from services.cli.places import announce
 from services.cli.progress import Clock, aside, console
 from services.demonstrations.store import DATA, open_store
-from services.distributed.ray_runner import RunnerKind, open_runner
+from services.distributed.ray_runner import RunnerKind, check_compute, open_runner
 from services.evaluation.summary import summarise
 from services.experiments.experiment import Experiment, OnNonfinite, changed_settings, check_settings
 from services.experiments.finished_run import FinishedRun
@@ -65,6 +67,15 @@ class Arguments:
     workers: int | None = None
     """Ray workers of each kind, one for each CPU of the cluster if not given; they do not change the result. Those that
     it has no CPU for yet join when it has grown."""
+    device: str = "auto"
+    """What computes gradients and adaptations: cpu; cuda, a GPU, or cuda:N with --runner local; auto takes the GPU that
+    Ray gave a worker, see --gpus, else the CPU."""
+    gpus: float | None = None
+    """GPUs that Ray reserves for each worker, up to 1; as many workers share one. If not given: none, or with --device
+    cuda an equal part of all."""
+    path: GradientPath = "auto"
+    """How a group's gradients are computed: loop, one slot after the other; batched, all slots at once, which differs
+    by rounding; auto is batched on a GPU."""
     overlap_evaluation: bool = True
     """Go on with meta-training during the evaluations that --evaluation.every asks for; the results are the same."""
     on_nonfinite: OnNonfinite = "stop"
@@ -77,10 +88,16 @@ class Arguments:
     """Name or folder of a run to go on with, with its own settings."""
     quiet: Quiet = False
 
+    @property
+    def compute(self) -> Compute:
+        """What computes."""
+        return Compute(self.device, self.path)
+
 
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     args, folder = _read(arguments)
+    check_compute(args.runner, args.compute, method_type(args.experiment.method.name), args.gpus)
     experiment = Experiment(args.experiment, store := open_store())
     announce(
         run=(folder, "--runs FOLDER"),
@@ -107,7 +124,10 @@ def _carry_out(args: Arguments, folder: Path, experiment: Experiment) -> None:
     status = "FAILED"
     try:
         record_settings(tracker, config)
-        with recording_system(tracker), open_runner(args.runner, experiment.suite, args.workers) as runner:
+        with (
+            recording_system(tracker),
+            open_runner(args.runner, experiment.suite, args.workers, args.compute, args.gpus) as runner,
+        ):
             clock.lap("start")
             data = experiment.collect(runner)
             tracker.inputs({dataset.id: dataset.digest for dataset in data.values()})

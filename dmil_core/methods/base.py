@@ -123,6 +123,8 @@ class Method(ABC, Generic[Config]):
 
     config_type: ClassVar[type[MethodConfig]]
     """Class of the settings, whose default name is the method's."""
+    on_gpu: ClassVar[bool] = False
+    """Whether it also computes inside `dmil_core.devices.computing_on` a GPU."""
 
     @classmethod
     def prepared(
@@ -223,6 +225,9 @@ class TaskGradient(NamedTuple):
 class MetaLearner(Method[Config], Generic[Config, BatchT]):
     """A method that learns across tasks, by gradients that add up over the slots of an iteration."""
 
+    batched: ClassVar[bool] = False
+    """Whether `task_gradients` is one computation."""
+
     @abstractmethod
     def sample(self, demonstrations: Sequence[Demonstration], iteration: int, rng: np.random.Generator) -> BatchT:
         """Draw the batch of one slot from the demonstrations of its task.
@@ -240,6 +245,10 @@ class MetaLearner(Method[Config], Generic[Config, BatchT]):
         With ``outer_step == "average"`` it is the parameters before the slot's own steps minus those after. The
         metrics contain ``loss``, and ``sub_skill_share/K`` for each sub-skill.
         """
+
+    def task_gradients(self, parameters: Parameters, batches: Sequence[BatchT]) -> list[TaskGradient]:
+        """Return `task_gradient` of several slots of an iteration, but for rounding."""
+        return [self.task_gradient(parameters, batch) for batch in batches]
 
 
 class OnlineMetaLearner(MetaLearner[Config, BatchT]):

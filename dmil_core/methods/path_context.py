@@ -17,13 +17,24 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int
 from torch import Tensor
+from torch.nn import functional
 
 from dmil_core.demonstrations import Demonstration, Normalisation, PathBatch, TaskBatch
 from dmil_core.errors import UserError
 from dmil_core.loss_gradients import LossGradient, loss_gradient
 from dmil_core.losses import differentiated, squared_errors
 from dmil_core.methods.base import Method, TaskGradient
-from dmil_core.networks import Network, Parameters, initialise, mlp, network, unflatten, without_graph
+from dmil_core.networks import (
+    Layer,
+    Network,
+    Parameters,
+    initialise,
+    mlp,
+    network,
+    on_default_device,
+    unflatten,
+    without_graph,
+)
 from dmil_core.points import Points, moved, position, present
 from dmil_core.settings import ContextConfig
 
@@ -153,7 +164,7 @@ class PathContext:
         """
         compared, anywhere = self.view.match(observations), self.view.anywhere(observations)
         rows = [self._row(observations, compared, anywhere, seen, rng) for seen in self.seen]
-        return torch.from_numpy(np.stack(rows, 1).reshape(len(observations) * len(rows), rows[0].shape[1]))
+        return on_default_device(np.stack(rows, 1).reshape(len(observations) * len(rows), rows[0].shape[1]))
 
     def _row(
         self,
@@ -197,20 +208,42 @@ def sample_path_batch(demonstrations: Sequence[Demonstration], rng: np.random.Ge
     return PathBatch(tuple(drawn[:shots]), tuple(drawn[shots : shots + QUERIES] or drawn), int(rng.integers(2**31)))
 
 
-def path_gradient(network: Network, batch: PathBatch, view: PathView) -> LossGradient:
-    """Return the squared error of what the network does at states of the batch's queries, and its gradient."""
+def _drawn(
+    batch: PathBatch, view: PathView
+) -> tuple[Float[Tensor, "rows features"], Float[Tensor, "states action_dim"]]:
+    """Return what is seen at states of the batch's queries, and the actions there."""
     rng = np.random.default_rng(batch.seed)
     observations = np.concatenate([one.observations for one in batch.query])
     chosen: Int[np.ndarray, " states"] = rng.integers(0, len(observations), QUERY_STATES)
-    actions = torch.from_numpy(np.concatenate([one.actions for one in batch.query])[chosen])
-    context = PathContext.of(batch.context, view)
+    actions = on_default_device(np.concatenate([one.actions for one in batch.query])[chosen])
+    return PathContext.of(batch.context, view).rows(observations[chosen], rng), actions
+
+
+def path_gradient(network: Network, batch: PathBatch, view: PathView) -> LossGradient:
+    """Return the squared error of what the network does at states of the batch's queries, and its gradient."""
+    rows, actions = _drawn(batch, view)
 
     def loss(outputs: Tensor) -> Tensor:
         return squared_errors(combined(outputs, len(batch.context)), actions).mean()
 
-    return loss_gradient(
-        network, context.rows(observations[chosen], rng), lambda outputs: differentiated(loss, outputs)
-    )
+    return loss_gradient(network, rows, lambda outputs: differentiated(loss, outputs))
+
+
+def path_gradients(network: Network, batches: Sequence[PathBatch], view: PathView) -> LossGradient:
+    """Return `path_gradient` of several batches as one computation; a batch with fewer demonstrations is padded."""
+    drawn, shots = [_drawn(batch, view) for batch in batches], [len(batch.context) for batch in batches]
+    most, actions = max(shots), torch.stack([actions for _, actions in drawn])
+    each = [rows.unflatten(0, (-1, count)) for (rows, _), count in zip(drawn, shots, strict=True)]
+    rows = torch.stack([functional.pad(of, (0, 0, 0, most - of.shape[1])).flatten(0, 1) for of in each])
+    absent = torch.arange(most) >= torch.tensor(shots)[:, None]
+
+    def loss(outputs: Float[Tensor, "batches rows outputs"]) -> Float[Tensor, " batches"]:
+        of_each = outputs.unflatten(1, (-1, most))
+        shares = of_each[..., -1:].masked_fill(absent[:, None, :, None], -torch.inf).softmax(2)
+        return ((of_each[..., :-1] * shares).sum(2) - actions).square().sum(-1).mean(-1)
+
+    copies = tuple(Layer(*(tensor.expand(len(batches), *tensor.shape) for tensor in layer)) for layer in network)
+    return loss_gradient(copies, rows, lambda outputs: differentiated(loss, outputs))
 
 
 @dataclass(frozen=True)
@@ -273,6 +306,28 @@ def with_path_gradient(
     views = unflatten(result.gradient, {name: tensor.shape for name, tensor in parameters.items()})
     of_path.add_to(network(views, "path"))
     return result._replace(metrics={**result.metrics, "path_loss": of_path.loss.value.item()})
+
+
+def with_path_gradients(
+    method: Method[Any], results: Sequence[TaskGradient], parameters: Parameters, batches: Sequence[TaskBatch]
+) -> list[TaskGradient]:
+    """Return `with_path_gradient` of several tasks, computed at once."""
+    if (view := view_of(method)) is None:
+        return list(results)
+    layers, paths = network(without_graph(parameters), "path"), [batch.path for batch in batches if batch.path]
+    of_path = path_gradients(layers, paths, view)
+    vector = tuple(Layer(*(tensor.new_zeros(len(paths), *tensor.shape) for tensor in layer)) for layer in layers)
+    of_path.add_to(vector)
+    shapes = {name: tensor.shape for name, tensor in parameters.items()}
+    for index, result in enumerate(results):
+        for view_of_layer, layer in zip(network(unflatten(result.gradient, shapes), "path"), vector, strict=True):
+            for part, values in zip(view_of_layer, layer, strict=True):
+                part.copy_(values[index])
+    losses = of_path.loss.value.tolist()
+    return [
+        result._replace(metrics={**result.metrics, "path_loss": loss})
+        for result, loss in zip(results, losses, strict=True)
+    ]
 
 
 def guide_of(method: Method[Any], parameters: Parameters, support: Sequence[Demonstration]) -> PathGuide | None:

@@ -7,10 +7,12 @@ from typing import Any, NamedTuple
 import torch
 
 from dmil_core.demonstrations import Demonstration
+from dmil_core.devices import USUAL, Compute, describe
 from dmil_core.methods.base import MetaLearner
 from dmil_core.networks import unflatten
 from dmil_core.outer_loop import NonfiniteSlot, add, group_gradient
 from services.distributed.chunking import Chunks, from_chunks, to_chunks
+from services.distributed.gpus import granted_gpu
 from services.distributed.simulation_worker import SimulationWorker
 from services.distributed.timing import Span
 from services.suites.base import TaskSuite
@@ -39,6 +41,8 @@ class BlockReport(NamedTuple):
     """Of each of its slots."""
     nonfinite: list[NonfiniteSlot]
     span: Span
+    device: str = "cpu"
+    """What computed it, as rows name it."""
 
 
 class AdaptationWorker:
@@ -51,15 +55,21 @@ class AdaptationWorker:
         demonstrations: Mapping[str, Sequence[Demonstration]],
         seed: int,
         suite: TaskSuite | None,
+        compute: Compute = USUAL,
     ) -> None:
         """Hold what does not change during the run; demonstrations stay in shared memory.
 
         A method that learns from rollouts in meta-training has them here, in environments of the suite, so that a slot
         stays pure work.
+
+        Raises:
+            UserError: for a device that there is not.
         """
         torch.set_num_threads(1)
         self._collect_rollouts = SimulationWorker(suite).collect_rollouts if suite is not None else None
         self._method, self._shapes, self._demonstrations, self._seed = method, shapes, demonstrations, seed
+        self._device = compute.device_for(method, granted=granted_gpu())
+        self._batched, self._device_name = compute.is_batched(method, self._device), describe(self._device)
 
     def gradient(self, parameters: Chunks, block: Block, previous: Sequence[Any] = ()) -> tuple[BlockReport, Chunks]:
         """Return a block's report, and the sum of its gradients, which is all that must travel.
@@ -73,7 +83,7 @@ class AdaptationWorker:
             WorkError: for a Python error in one of the slots.
         """
         started = time.perf_counter()
-        unflattened = unflatten(torch.from_numpy(from_chunks(parameters)), self._shapes)
+        unflattened = unflatten(torch.from_numpy(from_chunks(parameters)).to(self._device), self._shapes)
         results = [
             group_gradient(
                 self._method,
@@ -84,13 +94,14 @@ class AdaptationWorker:
                 block.tasks,
                 slots,
                 self._collect_rollouts,
+                batched=self._batched,
             )
             for slots in block.groups
         ]
         gradient = to_chunks(add([result.gradient for result in results]))
         metrics = [slot for result in results for slot in result.metrics]
         nonfinite = [slot for result in results for slot in result.nonfinite]
-        report = BlockReport(metrics, nonfinite, Span(started, time.perf_counter()))
+        report = BlockReport(metrics, nonfinite, Span(started, time.perf_counter()), self._device_name)
         if not previous:
             return report, gradient
         import ray  # the local runner, which never comes here, does without

@@ -5,10 +5,12 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
+from dmil_core.devices import USUAL, Compute
 from dmil_core.errors import WorkError
 from dmil_core.outer_loop import OuterState, blocks, groups, slot_label
 from services.distributed.adaptation_worker import AdaptationWorker, Block, BlockReport
 from services.distributed.calls import Call, DeadlyCallError, LostError
+from services.distributed.gpus import SHARES
 from services.distributed.learner import Learner, StepReport
 from services.distributed.metrics import Meter, WorkerCounter
 from services.distributed.runner import Iteration, Plan
@@ -52,6 +54,7 @@ class RayMetaTraining:
         gpus: float = 0.0,
         meter: Meter | None = None,
         min_workers: int | None = None,
+        compute: Compute = USUAL,
     ) -> None:
         """Start the actors; the demonstrations travel to each node once.
 
@@ -60,9 +63,10 @@ class RayMetaTraining:
             workers: number of adaptation workers, or a function that returns it as the cluster changes; at most one
                 for each group of slots is started.
             fan_in: gradients that a worker adds at a time, a power of two.
-            gpus: of each adaptation worker.
+            gpus: of each worker; the actors have the shares of `SHARES` of it.
             meter: records iterations, workers, and slots that are computed again.
             min_workers: workers to begin with, all by default; the others join when there is room for them.
+            compute: what computes.
         """
         import ray
 
@@ -70,14 +74,16 @@ class RayMetaTraining:
 
         self._ray, self._plan, self._fan_in = ray, plan, fan_in
         self._groups = groups(plan.settings)
+        self._learner_gpus = gpus * SHARES["learner"]
+        self._learner_device = compute.device if plan.method.on_gpu else "cpu"
         self._meter = meter or Meter()
         self.counter = WorkerCounter("adaptation", self._meter)
         self._workers: Callable[[], int] = workers if callable(workers) else lambda: workers
         shared = ray.put(plan.demonstrations)
 
         def start(cpus: int) -> Any:
-            remote = ray.remote(num_cpus=cpus, num_gpus=gpus)(AdaptationWorker)
-            return remote.remote(plan.method, plan.shapes, shared, plan.seed, plan.suite)
+            remote = ray.remote(num_cpus=cpus, num_gpus=gpus * SHARES["adaptation"])(AdaptationWorker)
+            return remote.remote(plan.method, plan.shapes, shared, plan.seed, plan.suite, compute)
 
         self._pool = Pool(
             lambda: start(1),
@@ -186,7 +192,7 @@ class RayMetaTraining:
         self._done, self._ready = self._done + 1, stepped.span.ended
         slots = [metrics for report in reports for metrics in report.metrics]
         nonfinite = [slot for report in reports for slot in report.nonfinite]
-        return Iteration(self._done, slots, nonfinite, stepped.gradient_norm, timing)
+        return Iteration(self._done, slots, nonfinite, stepped.gradient_norm, timing, reports[0].device)
 
     def state(self) -> OuterState:
         """Fetch the learner's state."""
@@ -236,10 +242,12 @@ class RayMetaTraining:
 
         here = NodeAffinitySchedulingStrategy(self._ray.get_runtime_context().get_node_id(), soft=True)
         # Out of order, so that the state can be fetched while a step waits for its gradients. One step waits at a time.
-        learner: Any = self._ray.remote(num_cpus=0, scheduling_strategy=here)(Learner).options(
-            allow_out_of_order_execution=True
+        learner: Any = self._ray.remote(num_cpus=0, num_gpus=self._learner_gpus, scheduling_strategy=here)(
+            Learner
+        ).options(allow_out_of_order_execution=True)
+        self._learner = learner.remote(
+            self._state, self._plan.settings, skip_nonfinite=self._plan.skip_nonfinite, device=self._learner_device
         )
-        self._learner = learner.remote(self._state, self._plan.settings, skip_nonfinite=self._plan.skip_nonfinite)
 
     def _fetch_parameters(self) -> None:
         """Continue from the learner's parameters."""

@@ -7,10 +7,13 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
+from dmil_core.devices import USUAL, Compute, device_of
 from dmil_core.errors import UserError, WorkError
+from dmil_core.methods.base import Method
 from services.cli.live_view import Workers
 from services.distributed.calls import Call, DeadlyCallError
-from services.distributed.cluster import cpus, joined
+from services.distributed.cluster import cpus, joined, named_address
+from services.distributed.gpus import SHARES, cluster_gpus, gpus_of_each
 from services.distributed.metrics import Meter, RayMeter, WorkerCounter
 from services.distributed.ray_meta_training import RayMetaTraining
 from services.distributed.runner import LocalRunner, Plan, Runner
@@ -30,32 +33,62 @@ RunnerKind = Literal["ray", "local"]
 
 
 @contextmanager
-def open_runner(kind: RunnerKind, suite: TaskSuite, workers: int | None) -> Iterator[Runner]:
+def open_runner(
+    kind: RunnerKind,
+    suite: TaskSuite,
+    workers: int | None,
+    compute: Compute = USUAL,
+    gpus: float | None = None,
+) -> Iterator[Runner]:
     """Open a runner and close it in the end, whatever happens.
 
     Raises:
-        UserError: if there is nobody to work.
+        UserError: if there is nobody to work, or no GPU where there must be one.
     """
     if workers is not None and workers < 1:
         raise UserError(f"--workers: got {workers}; wanted at least 1; leave it out for one for each CPU")
-    runner: Runner = LocalRunner(suite) if kind == "local" else RayRunner(suite, workers)
+    local = kind == "local"
+    runner: Runner = LocalRunner(suite, compute) if local else RayRunner(suite, workers, gpus, compute)
     try:
         yield runner
     finally:
         runner.close()
 
 
+def check_compute(kind: RunnerKind, compute: Compute, method: type[Method[Any]], gpus: float | None = None) -> None:
+    """Refuse, before there is any folder, what a method or this machine does not have.
+
+    Raises:
+        UserError: for a device, a path or a part of a GPU that cannot be.
+    """
+    compute.check(method)
+    if gpus is not None and (kind == "local" or not 0 < gpus <= 1):
+        where = " with --runner local" if kind == "local" else ""
+        raise UserError(f"--gpus: got {gpus}{where}; wanted above 0 and at most 1 of each of Ray's workers, or none")
+    if kind == "ray" and compute.wants_gpu and compute.device != "cuda":
+        raise UserError(f"--device: got {compute.device} with Ray, which picks a worker's GPU; wanted cuda")
+    if kind == "local" or named_address() is None:  # Ray is started on this machine
+        device_of(compute.device)
+
+
 class RayRunner:
     """Runs all work in Ray actors, of the cluster that this process belongs to or of one on this machine."""
 
-    def __init__(self, suite: TaskSuite, workers: int | None, gpus: float = 0.0) -> None:
+    def __init__(
+        self, suite: TaskSuite, workers: int | None, gpus: float | None = None, compute: Compute = USUAL
+    ) -> None:
         """Join a cluster, or start one, see `services.distributed.cluster`.
 
         Args:
             suite: of the experiment's tasks.
             workers: of each kind, by default one for each CPU of the cluster. Those that have no CPU yet join when
                 they have: an autoscaling cluster grows for them.
-            gpus: of each adaptation worker, which may be less than one.
+            gpus: of each worker, at most one. If not given: none, or an equal part of the cluster's if there must be
+                one.
+            compute: what computes.
+
+        Raises:
+            UserError: if there must be a GPU, and the cluster has none.
         """
         self._cluster = ExitStack()
         self._cluster.enter_context(joined(workers))
@@ -64,12 +97,13 @@ class RayRunner:
         from services.distributed.actor_pool import Pool
 
         self._ray, self._pool = ray, Pool
-        self._requested, self._gpus = workers, gpus
+        self._requested, self._compute = workers, compute
         if workers is not None and workers > cpus():
             logger.info(f"--workers {workers}: the cluster has {cpus()} CPUs now; further workers join as it grows")
         self.meter: Meter = RayMeter(suite.name)
         self._counter = WorkerCounter("simulation", self.meter)
         try:
+            self._gpus = gpus_of_each(compute, gpus, self._wanted_workers)
             self._suite = put_suite(suite, ray.put)
         except UserError:
             self._cluster.close()
@@ -80,7 +114,8 @@ class RayRunner:
     @property
     def workers(self) -> int:
         """How many workers of each kind there may be now: nodes come and go."""
-        return min(self._wanted_workers, cpus())
+        room = max(1, int(cluster_gpus() / self._gpus + 1e-6)) if self._gpus else self._wanted_workers
+        return min(self._wanted_workers, cpus(), room)
 
     @property
     def _wanted_workers(self) -> int:
@@ -104,7 +139,8 @@ class RayRunner:
         size = min(self.workers if pausing else self._wanted_workers, len(items))
 
         def start(cpus: int) -> Any:
-            return self._ray.remote(num_cpus=cpus)(SimulationWorker).remote(self._suite)
+            share = self._gpus * SHARES["simulation"]
+            return self._ray.remote(num_cpus=cpus, num_gpus=share)(SimulationWorker).remote(self._suite, self._compute)
 
         pool = self._pool(
             lambda: start(0 if pausing else 1),
@@ -122,16 +158,22 @@ class RayRunner:
     def simulate_in_background(self, items: Sequence[WorkItem[T]]) -> "RaySimulation[T]":
         """Run the items on one more worker, which gives way to meta-training and takes no CPU from its count."""
         if self._background is None:
-            remote = self._ray.remote(num_cpus=0)(BackgroundSimulationWorker)
+            share = self._gpus * SHARES["background"]
+            remote = self._ray.remote(num_cpus=0, num_gpus=share)(BackgroundSimulationWorker)
             self._background = self._pool(
-                lambda: remote.remote(self._suite), 1, max_in_flight=len(items), listener=self._counter
+                lambda: remote.remote(self._suite, self._compute), 1, max_in_flight=len(items), listener=self._counter
             )
         return RaySimulation(self._background, items)
 
     def meta_train(self, plan: Plan) -> RayMetaTraining:
         """Start the learner and the adaptation workers."""
         self._training = RayMetaTraining(
-            plan, lambda: self._wanted_workers, gpus=self._gpus, meter=self.meter, min_workers=self.workers
+            plan,
+            lambda: self._wanted_workers,
+            gpus=self._gpus,
+            meter=self.meter,
+            min_workers=self.workers,
+            compute=self._compute,
         )
         return self._training
 
@@ -145,10 +187,10 @@ class RayRunner:
 class BackgroundSimulationWorker(SimulationWorker):
     """A simulation worker of low priority."""
 
-    def __init__(self, suite: TaskSuite) -> None:
+    def __init__(self, suite: TaskSuite, compute: Compute = USUAL) -> None:
         """Simulate the tasks of `suite`."""
         os.nice(NICENESS)
-        super().__init__(suite)
+        super().__init__(suite, compute)
 
 
 class RaySimulation(Generic[T]):

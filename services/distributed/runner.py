@@ -8,6 +8,7 @@ import torch
 
 from dmil_core.configs import TrainingConfig
 from dmil_core.demonstrations import Demonstration
+from dmil_core.devices import USUAL, Compute
 from dmil_core.methods.base import MetaLearner
 from dmil_core.outer_loop import NonfiniteSlot, OuterState, groups, tasks_of
 from services.cli.live_view import Workers
@@ -55,6 +56,8 @@ class Iteration(NamedTuple):
     gradient_norm: float
     """Before clipping."""
     timing: Timing
+    device: str = "cpu"
+    """What computed its gradients, as rows name it."""
 
     @property
     def stepped(self) -> bool:
@@ -146,10 +149,10 @@ class LocalRunner:
     meter = Meter()
     worker_counts = ()
 
-    def __init__(self, suite: TaskSuite) -> None:
+    def __init__(self, suite: TaskSuite, compute: Compute = USUAL) -> None:
         """Simulate the tasks of `suite`; until it is closed, torch computes on one thread, as in Ray's workers."""
-        self._threads = torch.get_num_threads()
-        self._worker = SimulationWorker(suite)
+        self._threads, self._compute = torch.get_num_threads(), compute
+        self._worker = SimulationWorker(suite, compute)
 
     def share(self, value: T) -> Callable[[], T]:
         """Return a function that returns `value`."""
@@ -165,7 +168,7 @@ class LocalRunner:
 
     def meta_train(self, plan: Plan) -> "LocalMetaTraining":
         """Return the learner with one adaptation worker."""
-        return LocalMetaTraining(plan)
+        return LocalMetaTraining(plan, self._compute)
 
     def close(self) -> None:
         """Give torch its threads back."""
@@ -175,11 +178,12 @@ class LocalRunner:
 class LocalMetaTraining:
     """Meta-training in this process, one slot after the other."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Plan, compute: Compute = USUAL) -> None:
         """Start from the plan's state."""
         self._plan, self._next = plan, plan.state.iteration
-        self._learner = Learner(plan.state, plan.settings, skip_nonfinite=plan.skip_nonfinite)
-        self._worker = AdaptationWorker(plan.method, plan.shapes, plan.demonstrations, plan.seed, plan.suite)
+        device = compute.device if plan.method.on_gpu else "cpu"
+        self._learner = Learner(plan.state, plan.settings, skip_nonfinite=plan.skip_nonfinite, device=device)
+        self._worker = AdaptationWorker(plan.method, plan.shapes, plan.demonstrations, plan.seed, plan.suite, compute)
         self._ready, self._parameters = self._learner.parameters()
 
     def iterations(self, count: int) -> Iterator[Iteration]:
@@ -191,7 +195,8 @@ class LocalMetaTraining:
                 stepped, self._parameters = self._learner.step(gradient)
             timing = Timing.of(self._ready, {0: [report.span]}, stepped.span)
             self._next, self._ready = self._next + 1, stepped.span.ended
-            yield Iteration(self._next, report.metrics, report.nonfinite, stepped.gradient_norm, timing)
+            norm, slots = stepped.gradient_norm, report.metrics
+            yield Iteration(self._next, slots, report.nonfinite, norm, timing, report.device)
 
     def state(self) -> OuterState:
         """Return the learner's state."""

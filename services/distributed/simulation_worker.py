@@ -1,12 +1,14 @@
 """The actor that runs experts and adapted policies in the simulator."""
 
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import torch
 
+from dmil_core.devices import USUAL, Compute
 from dmil_core.errors import as_work_error
-from dmil_core.methods.base import Policy
+from dmil_core.methods.base import Method, Policy
 from dmil_core.trajectories import Rollout
+from services.distributed.gpus import granted_gpu
 from services.rollouts.episodes import collect_rollouts, parallel_episodes
 from services.suites.base import Environment, TaskSuite, build_env
 
@@ -38,10 +40,10 @@ class WorkItem(Protocol[ResultOut]):
 class SimulationWorker:
     """Builds environments once and uses them again; an episode depends on its seed alone."""
 
-    def __init__(self, suite: TaskSuite) -> None:
-        """Simulate the tasks of `suite`."""
+    def __init__(self, suite: TaskSuite, compute: Compute = USUAL) -> None:
+        """Simulate the tasks of `suite`, and adapt to them on a device."""
         torch.set_num_threads(1)
-        self.suite = suite
+        self.suite, self._compute = suite, compute
         self._envs: dict[str, list[Environment]] = {}
 
     def environments(self, task: str, count: int) -> list[Environment]:
@@ -53,6 +55,10 @@ class SimulationWorker:
         envs += [build_env(self.suite, task) for _ in range(count - len(envs))]
         self._envs[task] = envs
         return envs
+
+    def device_for(self, method: Method[Any]) -> torch.device:
+        """Return where a method adapts in this process; its policies act on the CPU."""
+        return self._compute.device_for(method, granted=granted_gpu())
 
     def run(self, item: WorkItem[Result]) -> Result:
         """Run a work item.

@@ -120,8 +120,17 @@ class AdaptationRollouts(AdaptationItem):
     def run(self, worker: SimulationWorker) -> AdaptationOutcome:
         """Adapt, and run the episodes."""
         envs, horizon = worker.environments(self.adaptation.task, len(self.adaptation.episodes)), worker.suite.horizon
+        device = worker.device_for(self.method)
         return evaluate_adaptation(
-            self.method, self.parameters(), self.adaptation, self.held_out(), envs, horizon, self.evaluation, self.seed
+            self.method,
+            self.parameters(),
+            self.adaptation,
+            self.held_out(),
+            envs,
+            horizon,
+            self.evaluation,
+            self.seed,
+            device,
         )
 
 
@@ -130,4 +139,7 @@ class AdaptationImitation(AdaptationItem):
 
     def run(self, worker: SimulationWorker) -> ImitationErrors:
         """Adapt, and compare the policy with demonstrations; nothing is simulated."""
-        return imitation_errors(self.method, self.parameters(), self.adaptation, self.held_out(), self.evaluation)
+        device = worker.device_for(self.method)
+        return imitation_errors(
+            self.method, self.parameters(), self.adaptation, self.held_out(), self.evaluation, device
+        )

@@ -107,7 +107,7 @@ class Evaluator:
         """Return a row for each episode and each adaptation, from the outcomes of the adaptations in their order."""
         episodes, adaptations = [], []
         for adaptation, outcome in zip(self.adaptations, outcomes, strict=True):
-            row = self._row(checkpoint, adaptation)
+            row = self._row(checkpoint, adaptation, outcome.device)
             episodes += _episode_rows(row, adaptation, outcome)
             adaptations.append(_adaptation_row(row, outcome, sub_skills_of(self.config.method)))
         failed = {task: dataset.failed for task, dataset in self._data.items()}
@@ -120,7 +120,7 @@ class Evaluator:
         return [
             ImitationResult.model_validate(
                 {
-                    **self._row(checkpoint, adaptation),
+                    **self._row(checkpoint, adaptation, outcome.device),
                     "support_error": _finite(outcome.support),
                     "held_out_error": _finite(outcome.held_out),
                 }
@@ -128,7 +128,7 @@ class Evaluator:
             for adaptation, outcome in zip(self.adaptations, outcomes, strict=True)
         ]
 
-    def _row(self, checkpoint: Checkpoint, adaptation: Adaptation) -> dict[str, object]:
+    def _row(self, checkpoint: Checkpoint, adaptation: Adaptation, device: str) -> dict[str, object]:
         """Return what names an adaptation in all of its rows."""
         settings = self.config.evaluation
         return {
@@ -137,6 +137,7 @@ class Evaluator:
             "method": self.config.method.name,
             "checkpoint": checkpoint.digest,
             "versions": library_versions(),
+            "device": device,
             "fine_tuning_steps": settings.fine_tuning_steps,
             "learning_rate": settings.learning_rate,
             "optimiser": settings.optimiser,

@@ -42,6 +42,8 @@ class _Row(BaseModel):
     displaced: int = 0
     """Displaced copies of the support set."""
     versions: dict[str, str]
+    device: str = "cpu"
+    """What adapted: cpu, or cuda and the card's name. The episodes are always the CPU's."""
 
 
 class EpisodeResult(_Row):

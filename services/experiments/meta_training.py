@@ -123,10 +123,13 @@ class IterationLog:
         """Start without any iterations."""
         self._runner, self._tracker, self._evaluations = runner, tracker, evaluations
         self._recent: deque[Mapping[str, float]] = deque(maxlen=RECENT)
-        self._collapse = CollapseWatch()
+        self._collapse, self._device = CollapseWatch(), "cpu"
 
-    def add(self, iteration: int, metrics: Mapping[str, float]) -> None:
-        """Record an iteration's metrics, without those that are not finite."""
+    def add(self, iteration: int, metrics: Mapping[str, float], device: str = "cpu") -> None:
+        """Record an iteration's metrics, without those that are not finite, and what computed it if not the CPU."""
+        if device != self._device:
+            self._device = device
+            self._tracker.tags({"device": device})
         self._tracker.metrics(iteration, {name: value for name, value in metrics.items() if np.isfinite(value)})
         self._runner.meter.record(SPOOL_RECORDS, float(self._tracker.waiting))
         self._recent.append(metrics)
@@ -170,7 +173,7 @@ def meta_train(
                             write()
                             raise _nonfinite_error(problem, writer.folder)
                         logger.warning(f"{problem}; the step is not taken")
-                    log.add(iteration.number, metrics)
+                    log.add(iteration.number, metrics, iteration.device)
                     bar.advance(1)
                     evaluations.poll()
                     if iteration.number % every == 0 or iteration.number == total:

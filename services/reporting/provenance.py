@@ -29,9 +29,16 @@ def origin_of_run(finished: FinishedRun) -> Section:
         ),
         _data_sets(finished),
         DataTable("Versions", ["library", "version"], list(manifest.versions.items())),
+        *_devices(finished),
         DataTable("Time", ["phase", "seconds"], list(finished.summary.seconds.items())),
     ]
     return Section("Where it comes from", parts)
+
+
+def _devices(finished: FinishedRun) -> list[Part]:
+    """Return what adapted, if that was not the CPU."""
+    devices = sorted({row.device for row in finished.episodes} - {"cpu"})
+    return [Prose(f"Adapted on {', '.join(devices)}; the episodes are the CPU's.")] if devices else []
 
 
 def _evaluating(finished: FinishedRun) -> str:

@@ -5,9 +5,11 @@ from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from dmil_core.configs import EvaluationConfig
 from dmil_core.demonstrations import Demonstration
+from dmil_core.devices import CPU, adapted_on, describe
 from dmil_core.methods.base import Method, Policy, SubSkillUse
 from dmil_core.networks import Parameters
 from dmil_core.seeding import named_seed
@@ -109,6 +111,8 @@ class AdaptationOutcome(NamedTuple):
 
     episodes: list[EpisodeOutcome]
     use: list[SubSkillUse]
+    device: str = "cpu"
+    """What adapted, as rows name it."""
 
 
 def evaluate_adaptation(
@@ -120,6 +124,7 @@ def evaluate_adaptation(
     horizon: int,
     evaluation: EvaluationConfig,
     seed: int,
+    device: torch.device = CPU,
 ) -> AdaptationOutcome:
     """Adapt to a support set and run the episodes that judge it: a pure function of its arguments.
 
@@ -133,13 +138,15 @@ def evaluate_adaptation(
         evaluation: how to adapt.
         seed: of the experiment; an episode is named by it, the task and the episode's number, so that all shots
             and methods meet the same episodes.
+        device: what adapts; the policy acts on the CPU.
     """
     support = adaptation.support(held_out)
-    policy = method.adapt(parameters, support, evaluation.fine_tuning)
+    policy = adapted_on(device, method, parameters, support, evaluation.fine_tuning)
     seeds = [named_seed(seed, "evaluation", adaptation.task, episode) for episode in adaptation.episodes]
     others = [demonstration for demonstration in held_out if demonstration not in support]
     episodes = [EpisodeOutcome.of(episode) for episode in rollout(policy, envs, seeds, horizon)]
-    return AdaptationOutcome(episodes, [policy.sub_skill_use(demonstration) for demonstration in others])
+    use = [policy.sub_skill_use(demonstration) for demonstration in others]
+    return AdaptationOutcome(episodes, use, describe(device))
 
 
 class ImitationErrors(NamedTuple):
@@ -149,6 +156,8 @@ class ImitationErrors(NamedTuple):
     """On what it was adapted to."""
     held_out: float | None
     """On the held-out demonstrations of the task that it was not adapted to, where there are any."""
+    device: str = "cpu"
+    """What adapted, as rows name it."""
 
 
 def imitation_errors(
@@ -157,9 +166,11 @@ def imitation_errors(
     adaptation: Adaptation,
     held_out: Sequence[Demonstration],
     evaluation: EvaluationConfig,
+    device: torch.device = CPU,
 ) -> ImitationErrors:
     """Adapt to a support set and compare the policy with demonstrations: no episodes, else as `evaluate_adaptation`."""
     support = adaptation.support(held_out)
-    policy = method.adapt(parameters, support, evaluation.fine_tuning)
+    policy = adapted_on(device, method, parameters, support, evaluation.fine_tuning)
     others = [demonstration for demonstration in held_out if demonstration not in support]
-    return ImitationErrors(imitation_error(policy, support), imitation_error(policy, others) if others else None)
+    of_others = imitation_error(policy, others) if others else None
+    return ImitationErrors(imitation_error(policy, support), of_others, describe(device))

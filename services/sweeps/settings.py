@@ -10,9 +10,10 @@ import numpy as np
 from pydantic import AliasChoices, Field, model_validator
 
 from dmil_core.configs import EvaluationConfig, ExperimentConfig, SuiteConfig, SuiteName, preset_of
+from dmil_core.devices import Compute, GradientPath
 from dmil_core.errors import UserError
 from dmil_core.seeding import named_rng
-from dmil_core.settings import Count, NotNegative, Seed, Settings
+from dmil_core.settings import Count, Seed, Settings
 from services.cli.composition import checked, method_named
 from services.cli.yaml_files import merged
 from services.evaluation.results import Metric
@@ -30,8 +31,23 @@ class Resources(Settings):
 
     workers: Annotated[int, Field(ge=1, le=1000, strict=True)] = 1
     """CPUs, with an adaptation worker and then a simulation worker on each."""
-    gpus: NotNegative = 0.0
-    """GPUs of each worker, which may be less than one: as many workers share one."""
+    gpus: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False, strict=True)] = 0.0
+    """GPUs of each worker, up to 1: as many workers share one."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """What computes: auto takes the GPU that a worker has, else the CPU."""
+    path: GradientPath = "auto"
+    """How a group's gradients are computed: loop, batched, or auto, which is batched on a GPU."""
+
+    @property
+    def compute(self) -> Compute:
+        """What computes."""
+        return Compute(self.device, self.path)
+
+    @model_validator(mode="after")
+    def _has_what_it_computes_on(self) -> "Resources":
+        if self.device == "cuda" and not self.gpus:
+            raise ValueError(f"resources.gpus: got {self.gpus} with device cuda; wanted above 0, for each worker")
+        return self
 
 
 class Budget(Settings):

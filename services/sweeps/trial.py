@@ -104,7 +104,7 @@ def run_trial(folder: Path, name: str, demonstrations: Path, environment: Mappin
 def _run(sweep: SweepFolder, trial: PlannedTrial, store: DemoStore, tracker: Tracker) -> TrialResult:
     config, resources, clock = trial.config, sweep.record.sweep.resources, Clock()
     experiment = Experiment(config, store)
-    runner = RayRunner(experiment.suite, resources.workers, resources.gpus)
+    runner = RayRunner(experiment.suite, resources.workers, resources.gpus, resources.compute)
     try:
         clock.lap("start")
         data = experiment.collect(runner)

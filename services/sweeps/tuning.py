@@ -14,6 +14,7 @@ from dmil_core.files import remove_file
 from services.cli.progress import Bar
 from services.demonstrations.store import data_root
 from services.distributed.cluster import cpus
+from services.distributed.gpus import gpus_of_each
 from services.storage.remote import STORAGE
 from services.sweeps.folders import RESULT, SweepFolder, TrialResult
 from services.sweeps.trial import HELD_OUT, ITERATION, run_trial, tracker_of
@@ -114,6 +115,7 @@ def tune_trials(sweep: SweepFolder) -> None:
         raise UserError(
             f"resources.workers: got {resources.workers} for each trial; the cluster has {cpus()} CPUs; wanted fewer"
         )
+    gpus_of_each(resources.compute, resources.gpus, resources.workers)  # before a trial waits for ever
     for name in left:
         remove_file(sweep.of_trial(name), RESULT)
     folder, root = sweep.path.absolute(), data_root().absolute()

@@ -166,13 +166,18 @@ def test_going_on_with_other_settings_is_refused(copied_run, train, flag: tuple[
     [
         (("--resume", "nowhere"), ("--resume: got 'nowhere'", "in runs")),
         (("--preset", "ml10-smoke", "--name", "run"), ("--name: got runs/run", "--resume runs/run")),
+        (("--runner", "local", "--device", "cuda:99"), ("device: got cuda:99; wanted cpu or auto", "sees ")),
+        (("--device", "cuda:99"), ("--device: got cuda:99 with Ray", "wanted cuda")),
+        (("--gpus", "2"), ("--gpus: got 2.0; wanted above 0 and at most 1",)),
+        (("--method", "mil", "--path", "batched"), ("--path: got batched for mil", "wanted loop or auto")),
     ],
-    ids=["no such run", "a name that is taken"],
+    ids=["no such run", "a name that is taken", "no such GPU", "a GPU by number", "two GPUs", "no such path"],
 )
 def test_a_run_that_cannot_be_is_refused(copied_run, complaint, arguments, words):
     copied_run(0)
     printed = complaint(meta_train.run, *arguments)
     assert all(word in printed for word in words), printed
+    assert [path.name for path in Path("runs").iterdir()] == ["run"]
 
 
 def descendants(session: str) -> list[psutil.Process]:

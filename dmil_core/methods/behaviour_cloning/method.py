@@ -19,6 +19,7 @@ class BehaviourCloning(MetaLearner[BehaviourCloningConfig, TaskBatch]):
     """Behaviour cloning on all meta-training tasks."""
 
     config_type = BehaviourCloningConfig
+    on_gpu = True
 
     def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the network."""

@@ -98,9 +98,16 @@ def high_level_loss(
     return loss.plus(expected, continuity_weight)
 
 
-def switching(probabilities: Float[Tensor, "steps sub_skills"]) -> Float[Tensor, " pairs"]:
+def switching(probabilities: Float[Tensor, "*tasks steps sub_skills"]) -> Float[Tensor, "*tasks pairs"]:
     """Return the probability that independent draws at two consecutive steps differ: 1 − Σ_k p_t[k]·p_{t+1}[k]."""
-    return 1 - (probabilities[:-1] * probabilities[1:]).sum(-1)
+    return 1 - (probabilities[..., :-1, :] * probabilities[..., 1:, :]).sum(-1)
+
+
+def pair_weights(lengths: Int[Tensor, " trajectories"], dtype: torch.dtype) -> Float[Tensor, " pairs"]:
+    """Return one by the length of the trajectory that two consecutive steps lie in; zero if they are of two."""
+    trajectory = torch.repeat_interleave(torch.arange(len(lengths), device=lengths.device), lengths)
+    within = trajectory[1:] == trajectory[:-1]
+    return within.to(dtype) / lengths[trajectory[:-1]]
 
 
 def continuity_loss(
@@ -112,7 +119,4 @@ def continuity_loss(
     expectation under independent draws from π_h has one, and equals the count when π_h is certain. A pair of steps
     on both sides of a trajectory's end is no switch.
     """
-    trajectory = torch.repeat_interleave(torch.arange(len(lengths)), lengths)
-    within = trajectory[1:] == trajectory[:-1]
-    weight = within.to(probabilities.dtype) / lengths[trajectory[:-1]]
-    return (switching(probabilities) * weight).sum() / len(lengths)
+    return (switching(probabilities) * pair_weights(lengths, probabilities.dtype)).sum() / len(lengths)

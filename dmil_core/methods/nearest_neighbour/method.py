@@ -16,6 +16,7 @@ class NearestNeighbour(Method[NearestNeighbourConfig]):
     """The nearest neighbour for observations and actions of given sizes."""
 
     config_type = NearestNeighbourConfig
+    on_gpu = True
 
     def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Return none: nothing is learned."""

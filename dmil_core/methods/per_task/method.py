@@ -16,6 +16,7 @@ class PerTask(Method[PerTaskConfig]):
     """Behaviour cloning from fresh weights on the support set alone."""
 
     config_type = PerTaskConfig
+    on_gpu = True
 
     def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the network."""

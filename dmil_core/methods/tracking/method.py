@@ -16,6 +16,7 @@ class Tracking(Method[TrackingConfig]):
     """Tracking of the demonstrated path, where a suite declares points."""
 
     config_type = TrackingConfig
+    on_gpu = True
 
     def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Return none: nothing is learned."""
