@@ -126,9 +126,22 @@ def test_a_folder_that_is_there_is_refused_and_nothing_is_left(complaint):
             ("episodes", "input_value=0", "greater than or equal to 1"),
         ),
         (("--checkpoint", "runs/run", "--tasks", "fly"), ("suite.test_tasks", "got fly", "reach")),
+        (
+            ("--checkpoint", "runs/run", "--runner", "local", "--device", "cuda:99"),
+            ("device: got cuda:99", "wanted cpu"),
+        ),
         ((), ("--checkpoint",)),
     ],
-    ids=["missing", "a typo", "damaged", "more shots than held out", "no episode", "unknown task", "not given"],
+    ids=[
+        "missing",
+        "a typo",
+        "damaged",
+        "more shots than held out",
+        "no episode",
+        "unknown task",
+        "no GPU",
+        "not given",
+    ],
 )
 def test_a_mistake_is_answered_with_what_is_allowed(complaint, trained: Path, arguments, words):
     if "parameters.safetensors" in words[0]:
