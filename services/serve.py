@@ -25,7 +25,7 @@ from services.serving.guard import digest_of
 from services.serving.limits import Limits
 from services.serving.token import MOST_BYTES, TOKEN, TOKEN_PATH, given_token
 from services.storage.private import private_token
-from services.storage.redaction import error_line
+from services.storage.redaction import error_line, redacted
 
 NAME = "dmil"
 """Of the application in Ray Serve."""
@@ -108,9 +108,9 @@ def _start(args: Arguments, digest: str) -> None:
         )
         serve.run(built(arguments), name=NAME, route_prefix="/")
     except RuntimeError as error:
-        raise RunError(
-            f"no replica starts: {error_line(error)}; wanted {args.replicas}, a CPU for each; give fewer --replicas"
-        ) from error
+        deployments = serve.status().applications[NAME].deployments.values()
+        why = redacted(" ".join(one.message for one in deployments).strip()) or error_line(error)
+        raise RunError(f"no replica starts: {why}\nwanted {args.replicas}, a CPU for each") from error
     finally:
         for number, handler in on_termination.items():
             signal.signal(number, handler)

@@ -74,7 +74,7 @@ class Replica:
         """Load the model, and listen if the replicas are to."""
         if ray.util.get_node_ip_address() == LOOPBACK:
             _keep_to_loopback()
-        play = ray.remote(played).options(num_cpus=0, max_calls=1).remote  # OpenGL goes with the process
+        play = ray.remote(num_cpus=0, max_calls=1)(played).remote  # OpenGL goes with the process
         shelf = cast("Shelf", _RemoteShelf(shelf_of(arguments.limits)))
         service = Service(load(arguments.model, arguments.runs), shelf, arguments.limits, play)
         self._application: Any = application(service, arguments.token_digest)
