@@ -21,6 +21,7 @@ keep() { # write stdin to a secret's file unless it exists
 }
 
 drawn 32 | keep ray_token
+drawn 32 | keep serve_token
 drawn 24 | keep postgres_password
 drawn 24 | keep grafana_password
 # The object store shares two keys with each of its clients, so these files are only written together.

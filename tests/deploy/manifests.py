@@ -103,6 +103,14 @@ def pods(document: Document) -> Iterator[tuple[str, Document, dict[str, str], Se
             flags = [f"--{key}={value}" for key, value in group["rayStartParams"].items()]
             place = ["--head"] if kind == "head" else ["--address=head:6379"]
             yield f"{name}, {kind}", group["template"], labels, ["ray", "start", *place, *flags]
+    elif document["kind"] == "RayService":
+        cluster = spec["rayClusterConfig"]
+        for group in (cluster["headGroupSpec"], *cluster["workerGroupSpecs"]):
+            flags = [f"--{key}={value}" for key, value in group["rayStartParams"].items()]
+            place = ["--head"] if group is cluster["headGroupSpec"] else ["--address=head:6379"]
+            served = f"--port={yaml.safe_load(spec['serveConfigV2'])['http_options']['port']}"
+            labels = group["template"]["metadata"]["labels"]
+            yield name, group["template"], labels, ["ray", "start", *place, *flags, served]
     elif document["kind"] == "RayJob":
         yield name, spec["submitterPodTemplate"], spec["submitterPodTemplate"]["metadata"]["labels"], ()
 

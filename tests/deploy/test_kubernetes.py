@@ -30,7 +30,7 @@ from tests.deploy.manifests import (
 pytestmark = pytest.mark.thorough
 
 SCHEMAS = Path(__file__).parent / "schemas"
-KUBERAY = {"RayCluster": "rayclusters.v1.json", "RayJob": "rayjobs.v1.json"}
+KUBERAY = {"RayCluster": "rayclusters.v1.json", "RayJob": "rayjobs.v1.json", "RayService": "rayservices.v1.json"}
 GIVEN = {"postgres": {5432}, "submitter": set()}
 """Ports that are the default of their programs."""
 BYTES = {"Mi": 2**20, "Gi": 2**30}
@@ -239,16 +239,18 @@ def test_secrets_are_referred_to_and_made_by_the_generator():
     made = {
         (entry["name"], pair.partition("=")[0]) for entry in generator["secretGenerator"] for pair in entry["files"]
     }
+    service = rendered(DEPLOY / "kuberay" / "serving")
     for name in OVERLAYS:
-        assert "Secret" not in {document["kind"] for document in overlay(name)}
-        assert set(secrets_named(list(overlay(name)))) == made
+        found = [*overlay(name), *service]
+        assert "Secret" not in {document["kind"] for document in found}
+        assert set(secrets_named(found)) == made
 
 
 def test_the_generator_makes_secrets_of_the_files(tmp_path: Path, make_secrets: Callable[[Path], None]):
     (tmp_path / "kustomization.yaml").write_bytes((DEPLOY / "secrets" / "kustomization.yaml").read_bytes())
     make_secrets(tmp_path)
     found = rendered(tmp_path)
-    assert {document["metadata"]["name"] for document in found} == {"ray-token", "postgres-password"}
+    assert {document["metadata"]["name"] for document in found} == {"ray-token", "serve-token", "postgres-password"}
     code, output = against_kubernetes(found, tmp_path / "core")
     assert code == 0, output
 
