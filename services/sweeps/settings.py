@@ -13,7 +13,7 @@ from dmil_core.configs import EvaluationConfig, ExperimentConfig, SuiteConfig, S
 from dmil_core.devices import Compute, GradientPath
 from dmil_core.errors import UserError
 from dmil_core.seeding import named_rng
-from dmil_core.settings import Count, Seed, Settings
+from dmil_core.settings import Count, Flag, Seed, Settings
 from services.cli.composition import checked, method_named
 from services.cli.yaml_files import merged
 from services.evaluation.results import Metric
@@ -68,9 +68,9 @@ class Budget(Settings):
 class Range(Settings):
     """Numbers to draw from, evenly, or evenly by their logarithms."""
 
-    low: float
-    high: float
-    log: bool = False
+    low: Annotated[float, Field(strict=True)]
+    high: Annotated[float, Field(strict=True)]
+    log: Flag = False
 
     @model_validator(mode="after")
     def _in_order(self) -> "Range":

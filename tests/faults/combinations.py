@@ -23,6 +23,7 @@ import tyro
 from services.reporting import run_report
 from services.storage import replication
 from services.tracking import tracker
+from services.tracking.client import set_mlflow_defaults
 from tests.faults.strokes import STROKES, MachineLost, Stroke
 from tests.faults.toy_package import install
 from tests.faults.worlds import World
@@ -255,6 +256,7 @@ def check_delivered(world: World, losses: int) -> None:
 def prepare(folder: Path) -> Path:
     """Import what runs need, make what they share, and return an MLflow database with its tables."""
     sys.path.insert(0, str(install(folder)))
+    set_mlflow_defaults()
     for module in LATE_IMPORTS:
         import_module(module)
     run_report.write_run_page = lambda run, path: path.write_text("")  # its pictures take longer than the run

@@ -20,6 +20,7 @@ from services.cli.composition import EARLY, config_from
 from services.demonstrations.external import places_of
 from services.demonstrations.store import data_root
 from services.storage.run_folders import find_folder, new_name
+from services.sweeps.settings import Sweep
 from tests.faults.conftest import SHORT, TOY
 
 
@@ -91,7 +92,7 @@ def lenient(schema: object, place: str) -> Iterator[str]:
 
 @pytest.mark.parametrize(
     "model",
-    [ExperimentConfig, Manifest, Source, *(config_type(name) for name in OURS)],
+    [ExperimentConfig, Manifest, Source, Sweep, *(config_type(name) for name in OURS)],
     ids=lambda model: model.__name__,
 )
 def test_no_number_is_taken_as_text(model: type[BaseModel]):
