@@ -255,7 +255,10 @@ def making_folder(root: Path, name: Name, *, instead: bool = False) -> Iterator[
     path = root / name
     beside = path.with_name(f"{WRITING}{secrets.token_hex(8)}")
     with _parent(root, name, make=True) as folder:
-        os.mkdir(beside.name, dir_fd=folder)
+        try:
+            os.mkdir(beside.name, dir_fd=folder)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(path)) from None
         try:
             yield beside
             for made in (*beside.rglob("*"), beside):

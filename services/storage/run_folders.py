@@ -3,10 +3,11 @@
 import os
 import shlex
 import unicodedata
+from collections.abc import Mapping
 from pathlib import Path
 
 from dmil_core.errors import UserError, shorten
-from dmil_core.files import ForeignFileError, at_home, inside
+from dmil_core.files import ForeignFileError, at_home, create_file, inside, making_folder
 
 MOST_BYTES = 255 - len(".checkpoint")
 """Of a name, as file systems have it; some room is left for names that are made of it."""
@@ -32,14 +33,20 @@ def new_name(name: str, runs: Path) -> Path:
     return runs / unicodedata.normalize("NFC", name)
 
 
-def make_folder(folder: Path) -> None:
-    """Make the folder of a new run or sweep, of two at once for one of them only.
+def make_folder(folder: Path, files: Mapping[str, str] | None = None) -> None:
+    """Make the folder of a new run or sweep with its first files, of two at once for one of them only.
+
+    It is there whole or not at all: what is killed meanwhile has not taken the name.
 
     Raises:
         UserError: if its name is taken.
     """
+    if folder.exists():
+        raise _taken(folder)
     try:
-        folder.mkdir(parents=True)
+        with making_folder(folder.parent, folder.name) as made:
+            for name, content in (files or {}).items():
+                create_file(made, name, content.encode())
     except FileExistsError as error:
         raise _taken(folder) from error
 

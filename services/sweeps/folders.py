@@ -85,8 +85,7 @@ class SweepFolder:
     @classmethod
     def make(cls, path: Path, record: SweepRecord) -> "SweepFolder":
         """Make it, with what the sweep is."""
-        make_folder(path)
-        write_file(path, MARK, record.model_dump_json(indent=1) + "\n")
+        make_folder(path, {MARK: record.model_dump_json(indent=1) + "\n"})
         return cls(path)
 
     @cached_property

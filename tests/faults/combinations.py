@@ -20,6 +20,7 @@ from random import Random
 import numpy as np
 import tyro
 
+from dmil_core.files import WRITING
 from services.reporting import run_report
 from services.storage import replication
 from services.tracking import tracker
@@ -113,6 +114,10 @@ class Combination:
             write_demos(world.place / DEMOS, self.demos)
         return world
 
+    def has_claimed(self, world: World) -> bool:
+        """Whether the storage has noted whose the name is, and nothing else yet: another run needs another name."""
+        return (world.storage / "runs" / world.run.name / "claim").exists()
+
     def arguments(self) -> list[str]:
         """Return the arguments of a new run."""
         demos = [f"--demos=npz:{task}={DEMOS}" for task in ("a", "b", "d")] if self.demos else []
@@ -199,6 +204,8 @@ def attempt(number: int, root: Path, template: Path) -> str:
     code, reached = strike(combination, struck, seconds)
     if code:
         resumes = struck.is_begun or (struck.storage / "runs" / struck.run.name / "config.json").exists()
+        if isinstance(combination.stroke, MachineLost) and not resumes and combination.has_claimed(struck):
+            return "lost with its name"
         again = [f"--resume={struck.run}", "--runner", "local"] if resumes else combination.arguments()
         resumed = struck.start("meta_train", *again).wait()
         demand(resumed == 0, f"exit code {code}, then {resumed} with {again[0]}")
@@ -241,7 +248,7 @@ def check_beside(world: World, before: dict[str, str], *, is_sudden: bool = Fals
     after = world.bystanders()
     changed = sorted(name for name in before.keys() | after.keys() if before.get(name) != after.get(name))
     if is_sudden:
-        changed = [name for name in changed if not name.startswith("tmp")]
+        changed = [name for name in changed if not name.startswith("tmp") and WRITING not in name]
     demand(not changed, f"changed: {', '.join(changed)}")
     demand("Traceback" not in world.printed(), "a traceback")
 

@@ -20,6 +20,7 @@ from services.distributed import metrics
 from services.evaluation import evaluator
 from services.experiments import meta_training
 from services.reporting import run_report
+from services.storage import run_folders
 from services.storage.checkpoints import Checkpoints
 from tests.faults.conftest import SHORT, TOY
 
@@ -161,6 +162,18 @@ def test_a_quota_that_demonstrations_do_not_fit_in_is_told(workplace, monkeypatc
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert "but a quota or ulimit -f allows less" in capsys.readouterr().err
     assert not list((workplace / "own").rglob("*.hdf5"))
+
+
+def test_what_ends_a_start_has_taken_the_name_with_settings_to_go_on_with_or_not_at_all(workplace, monkeypatch, capsys):
+    def stopped(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    for module, function in ((run_folders, "create_file"), (meta_train, "claim_name")):
+        with monkeypatch.context() as interrupted:
+            interrupted.setattr(module, function, stopped)
+            assert exit_code(meta_train.run, [*TOY, *SHORT, "--name", "run"]) == 130
+    assert exit_code(meta_train.run, ["--resume", "run", "--runner", "local"]) == 0
+    assert names(workplace / "runs" / "run")[-1] == "iteration-0000004"
 
 
 @pytest.mark.parametrize("number", stopping.STOPS)
