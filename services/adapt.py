@@ -1,6 +1,10 @@
 """Adapt a model to demonstrations of your own, show what came of it, and save the policy to a folder.
 
 With two or more demonstrations each is left out in turn: the error on the one left out chooses the number of steps.
+For example:
+
+  dmil adapt ml45 --demos npz:mine.npz --output peg
+  dmil adapt ml45 --demos npz:mine.npz --output lock --suite ml45 --task door-lock
 """
 
 import sys
@@ -40,7 +44,8 @@ class Arguments:
     """Arguments of ``adapt``."""
 
     model: Annotated[str, tyro.conf.Positional]
-    """A run's name, its folder or that of a checkpoint, or models:/NAME@champion."""
+    """A model that comes with the project, as ml10; a run's name, its folder or that of a checkpoint; or
+    models:/NAME@champion."""
     demos: str
     """Demonstrations of one task, as npz:mine.npz; see docs/data.md."""
     output: Path = Path("policy")

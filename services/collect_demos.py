@@ -1,8 +1,11 @@
 """Let the scripted experts make the demonstrations of an experiment, and show what is in the store.
 
 What is there already is not made again. With a word before all flags it does other things, each with a --help of its
-own: ``verify`` counts how often each expert does its task, ``inspect DATA`` looks into a data set, ``record`` stores
-rollouts of any policy as demonstrations.
+own: verify counts how often each expert does its task, inspect looks into a data set, record stores rollouts of any
+policy as demonstrations. For example:
+
+  dmil collect-demos --suite ml45
+  dmil collect-demos inspect mine.npz
 """
 
 import sys

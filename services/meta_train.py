@@ -1,6 +1,10 @@
 """Collect demonstrations, meta-train, adapt to unseen tasks and measure the success rates.
 
-Every setting is a flag; what is not given comes from the YAML file of --config, and else from --preset.
+Every setting is a flag; what is not given comes from the YAML file of --config, and else from --preset. For example:
+
+  dmil meta-train --preset ml10-quick
+  dmil meta-train --suite kitchen --method mil --seed 1
+  dmil meta-train --resume NAME --training.iterations 5000
 """
 
 import os
@@ -170,7 +174,7 @@ def _carry_out(args: Arguments, folder: Path, experiment: Experiment) -> None:
 
 def _read(arguments: Sequence[str]) -> tuple[Arguments, Path]:
     """Return the arguments and the run's folder, which a new one does not have yet."""
-    early = peek(arguments, **EARLY, resume=str, runs=Path)
+    early = peek(arguments, **EARLY, resume=str, runs=Path, name=str)
     if early.resume is None:
         args = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(early)))
         config = args.experiment
@@ -181,6 +185,10 @@ def _read(arguments: Sequence[str]) -> tuple[Arguments, Path]:
         raise UserError(
             "--resume: got --preset, --config, --suite, --method or --demos with it; wanted none: a run goes on with "
             "its own settings"
+        )
+    if early.name is not None:
+        raise UserError(
+            f"--name: got {early.name} with --resume; wanted one of them: a run that goes on keeps its name"
         )
     runs = early.runs or Arguments.runs
     wanted = Path(early.resume) if Path(early.resume).name != early.resume else runs / early.resume

@@ -7,8 +7,9 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from dmil_core.errors import UserError
+from dmil_core.errors import UserError, nearest
 from services.cli.arguments import exit_code
+from services.cli.help_texts import command_of
 from services.cli.progress import console
 
 KINDS = {
@@ -29,13 +30,15 @@ def run(arguments: Sequence[str]) -> None:
         UserError: if it names nothing that can be drawn.
     """
     if arguments and arguments[0] in {"--help", "-h"}:
-        console.print("usage: python -m services.report KIND [--help]\n")
+        console.print(f"usage: {command_of('services.report')} KIND [--help]\n")
         for kind, module in KINDS.items():
-            console.print(f"  {kind:10}{(import_module(module).__doc__ or '').splitlines()[0]}")
+            console.print(f"  {kind:12}{(import_module(module).__doc__ or '').splitlines()[0]}")
         return
     if not arguments or arguments[0] not in KINDS:
         got = arguments[0] if arguments else "nothing"
-        raise UserError(f"report: got {got}; wanted one of {', '.join(KINDS)}, each with a --help of its own")
+        raise UserError(
+            f"report: got {got}; {nearest(got, KINDS)}wanted one of {', '.join(KINDS)}, each with a --help of its own"
+        )
     import_module(KINDS[arguments[0]]).run(arguments[1:])
 
 

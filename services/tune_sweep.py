@@ -15,7 +15,7 @@ from typing import Annotated
 import tyro
 from pydantic import ValidationError
 
-from dmil_core.errors import RunError, UserError, describe_errors
+from dmil_core.errors import RunError, UserError, describe_errors, nearest
 from services.cli.arguments import Quiet, exit_code, parse
 from services.cli.places import announce
 from services.cli.progress import Clock, console
@@ -139,6 +139,11 @@ def _begun(args: Arguments) -> SweepFolder:
     if args.sweep is None:
         raise UserError(f"SWEEP: got none; wanted a file as tune_configs/em.yaml, or one of {', '.join(known)}")
     file = CONFIGS / f"{args.sweep}.yaml" if args.sweep in known else Path(args.sweep)
+    if not file.exists():
+        raise UserError(
+            f"SWEEP: got {args.sweep}; {nearest(file.stem, known)}wanted a readable YAML file, or one of "
+            f"{', '.join(known)}"
+        )
     try:
         sweep = _read(file).at(args.preset, args.suites or (), args.seeds or ())
     except ValidationError as error:

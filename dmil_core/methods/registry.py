@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from dmil_core.errors import UserError, shorten
+from dmil_core.errors import UserError, nearest, shorten
 from dmil_core.methods.base import Method
 from dmil_core.methods.behaviour_cloning.method import BehaviourCloning
 from dmil_core.methods.dmil.method import Dmil
@@ -55,7 +55,8 @@ def method_type(name: object) -> type[Method[Any]]:
             return OURS[name]
         if name in registered:
             return _loaded(registered[name])
-    raise UserError(f"method.name: got {shorten(name)}; wanted one of {', '.join(method_names())}")
+    known = method_names()
+    raise UserError(f"method.name: got {shorten(name)}; {nearest(name, known)}wanted one of {', '.join(known)}")
 
 
 def config_type(name: object) -> type[MethodConfig]:

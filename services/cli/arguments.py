@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
-from pydantic import ValidationError
 
-from dmil_core.errors import RunError, UserError, describe_errors
+from dmil_core.errors import RunError, UserError, nearest
 from dmil_core.files import at_home
 from services.cli.escapes import for_terminal
+from services.cli.help_texts import InvalidSettingsError, command_of, describe_flags, flowing, flowing_registry
 from services.cli.progress import console_logging
 from services.cli.stopping import stoppable
 from services.cli.streams import steady_streams
@@ -64,18 +64,18 @@ def parse(program: type[T], description: str, arguments: Sequence[str], defaults
     Raises:
         UserError: for a value that a setting does not allow; what is no flag at all ends with exit code 2.
     """
-    module = program.__module__ if program.__module__ != "__main__" else f"services.{Path(sys.argv[0]).stem}"
     try:
         read = tyro.cli(
             program,
             config=(tyro.conf.AvoidSubcommands,),
-            prog=f"python -m {module}",
+            prog=command_of(program.__module__),
             args=arguments,
-            description=description,
+            description=flowing(description),
             default=defaults,
+            registry=flowing_registry(),
         )
-    except ValidationError as error:
-        raise UserError(describe_errors(error)) from error
+    except InvalidSettingsError as error:
+        raise UserError(describe_flags(error.error, defaults)) from error
     paths = {name: at_home(value) for name, value in vars(read).items() if isinstance(value, Path)}
     return dataclasses.replace(read, **paths)  # type: ignore[type-var]  every program's is a dataclass
 
@@ -122,5 +122,6 @@ def main() -> None:
     for program, purpose in PROGRAMS.items():
         print(f"  {program:15}{purpose}")
     if name not in ("--help", "-h"):
-        print(f"\nerror: got the program {name!r}; wanted one of {', '.join(PROGRAMS)}", file=sys.stderr)
+        wanted = f"{nearest(name, PROGRAMS)}wanted one of {', '.join(PROGRAMS)}"
+        print(f"\nerror: got the program {name!r}; {wanted}", file=sys.stderr)
         sys.exit(2)

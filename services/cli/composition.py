@@ -16,7 +16,7 @@ from dmil_core.configs import (
     SuiteConfig,
     preset_of,
 )
-from dmil_core.errors import UserError, describe_errors, shorten
+from dmil_core.errors import UserError, describe_errors, nearest, shorten
 from services.cli.yaml_files import merged, read_yaml
 
 DEFAULT_SUITE, DEFAULT_PRESET = "ml10", "quick"
@@ -51,7 +51,12 @@ def config_from(
     named, _, size = preset.rpartition("-")
     if size not in BASE_PRESETS or (named and preset not in PRESETS):
         raise UserError(
-            f"--preset: got {preset!r}; wanted {', '.join(BASE_PRESETS)}, with --suite, or one of {', '.join(PRESETS)}"
+            f"--preset: got {preset!r}; {nearest(preset, [*BASE_PRESETS, *PRESETS])}wanted {', '.join(BASE_PRESETS)}, "
+            f"with --suite, or one of {', '.join(PRESETS)}"
+        )
+    if suite is not None and named and suite.lower() != named.lower():
+        raise UserError(
+            f"--suite: got {suite} with --preset {preset}, which is {named}'s; wanted one suite; give --preset {size}"
         )
     from_file = {} if file is None else read_yaml(file, "--config")
     try:

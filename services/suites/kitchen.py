@@ -15,7 +15,7 @@ from jaxtyping import Float32, Float64
 
 from dmil_core.configs import SuiteConfig
 from dmil_core.demonstrations import Demonstration, DemonstrationError
-from dmil_core.errors import UserError
+from dmil_core.errors import UserError, nearest
 from dmil_core.points import Points
 from services.suites.base import Environment, Expert
 from services.suites.kitchen_expert import KitchenExpert, kitchen_model
@@ -172,7 +172,9 @@ class KitchenSuite:
         """
         name = DEFAULT_SPLIT if config.name.lower() == "kitchen" else config.name.lower()
         if name not in SPLITS:
-            raise UserError(f"suite.name: got {config.name}; wanted kitchen or {', '.join(SPLITS)}")
+            raise UserError(
+                f"suite.name: got {config.name}; {nearest(config.name, SPLITS)}wanted kitchen or {', '.join(SPLITS)}"
+            )
         if config.protocol != "paper" or not config.goal_visible:
             field = "goal_visible: got False" if config.protocol == "paper" else f"protocol: got {config.protocol}"
             raise UserError(f"suite.{field}; that is Meta-World's; leave it out for {name}")
@@ -228,7 +230,10 @@ def sub_tasks_of(task: str, field: str = "task") -> tuple[str, ...]:
     """
     chain = tuple(task.split("-"))
     if not set(chain) <= set(NAMES) or len(set(chain)) < len(chain):
-        raise UserError(f"{field}: got {task}; wanted some of {', '.join(NAMES)}, each at most once, joined by hyphens")
+        raise UserError(
+            f"{field}: got {task}; {nearest(task, NAMES)}wanted some of {', '.join(NAMES)}, each at most once, joined "
+            "by hyphens"
+        )
     return chain
 
 

@@ -11,7 +11,7 @@ from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from metaworld.policies import ENV_POLICY_MAP
 
 from dmil_core.configs import SuiteConfig
-from dmil_core.errors import UserError
+from dmil_core.errors import UserError, nearest
 from dmil_core.points import Points
 from services.suites.base import Environment, Expert, Measure
 from services.suites.metaworld_speed import fast_environment
@@ -127,8 +127,8 @@ class MetaWorldSuite:
             known = ", ".join(name for name in SPLITS if not name.startswith("ML1-"))
             tasks = ", ".join(task for task in TASKS if f"ML1-{task}" in SPLITS)
             raise UserError(
-                f"suite.name: got {config.name}; wanted {known}, kitchen-topburner, -microwave, -kettle or -slide, or "
-                f"ML1- and one of {tasks}"
+                f"suite.name: got {config.name}; {nearest(config.name, SPLITS)}wanted {known}, kitchen-topburner, "
+                f"-microwave, -kettle or -slide, or ML1- and one of {tasks}"
             )
         train, test = SPLITS[name]
         self.name = name if config.train_tasks is config.test_tasks is None else f"{name}-part"
@@ -136,7 +136,10 @@ class MetaWorldSuite:
         self.test_tasks = test if config.test_tasks is None else config.test_tasks
         for field, tasks in (("train_tasks", self.train_tasks), ("test_tasks", self.test_tasks)):
             if unknown := [task for task in tasks if task not in TASKS]:
-                raise UserError(f"suite.{field}: got {', '.join(unknown)}; wanted some of {', '.join(TASKS)}")
+                raise UserError(
+                    f"suite.{field}: got {', '.join(unknown)}; {nearest(unknown[0], TASKS)}wanted some of "
+                    f"{', '.join(TASKS)}"
+                )
         self.horizon = config.horizon or HORIZONS[config.protocol]
         self._goal_visible = config.goal_visible
         rule = f"goal {'visible' if config.goal_visible else 'hidden'}; success at any step within {self.horizon}"

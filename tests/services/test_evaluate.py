@@ -123,7 +123,7 @@ def test_a_folder_that_is_there_is_refused_and_nothing_is_left(complaint):
         (("--checkpoint", "runs/run", "--evaluation.shots", "5"), ("held_out", "got 4", "wanted at least 5")),
         (
             ("--checkpoint", "runs/run", "--evaluation.episodes", "0"),
-            ("episodes", "input_value=0", "greater than or equal to 1"),
+            ("error: --evaluation.episodes: got 0; input should be greater than or equal to 1",),
         ),
         (("--checkpoint", "runs/run", "--tasks", "fly"), ("suite.test_tasks", "got fly", "reach")),
         (

@@ -165,13 +165,22 @@ def test_going_on_with_other_settings_is_refused(copied_run, train, flag: tuple[
     ("arguments", "words"),
     [
         (("--resume", "nowhere"), ("--resume: got 'nowhere'", "in runs")),
+        (("--resume", "run", "--name", "other"), ("--name: got other with --resume",)),
         (("--preset", "ml10-smoke", "--name", "run"), ("--name: got runs/run", "--resume runs/run")),
         (("--runner", "local", "--device", "cuda:99"), ("device: got cuda:99; wanted cpu or auto", "sees ")),
         (("--device", "cuda:99"), ("--device: got cuda:99 with Ray", "wanted cuda")),
         (("--gpus", "2"), ("--gpus: got 2.0; wanted above 0 and at most 1",)),
         (("--method", "mil", "--path", "batched"), ("--path: got batched for mil", "wanted loop or auto")),
     ],
-    ids=["no such run", "a name that is taken", "no such GPU", "a GPU by number", "two GPUs", "no such path"],
+    ids=[
+        "no such run",
+        "another name",
+        "a name that is taken",
+        "no such GPU",
+        "a GPU by number",
+        "two GPUs",
+        "no such path",
+    ],  # fmt: skip
 )
 def test_a_run_that_cannot_be_is_refused(copied_run, complaint, arguments, words):
     copied_run(0)

@@ -16,6 +16,7 @@ from dmil_core.configs import PRESETS
 from dmil_core.errors import UserError
 from services.cli.arguments import PROGRAMS, parse
 from services.cli.composition import config_from
+from services.cli.help_texts import COMMANDS
 from services.meta_train import Arguments, run
 
 SERVICES = Path(services.__path__[0])
@@ -57,7 +58,9 @@ def test_a_file_overrides_the_preset_and_a_flag_overrides_the_file(yaml_file):
     assert found.method.inner_learning_rate == preset.method.inner_learning_rate
     assert found.training == preset.training
     assert settings(file=file).method.sub_skills == 5
-    assert config_from("ml10-smoke", None, suite="ml45").suite.name == "ml45"
+    assert config_from("smoke", None, suite="ml45").suite.name == "ml45"
+    with pytest.raises(UserError, match=r"--suite: got ml45 with --preset ml10-smoke, .*; give --preset smoke"):
+        config_from("ml10-smoke", None, suite="ml45")
     assert settings() == preset
 
 
@@ -70,15 +73,36 @@ def test_a_setting_that_may_be_none_can_be_given_and_taken_back():
 MISTAKES = {
     "unknown flag": (("--method.sub-skill-count", "5"), ("--method.sub-skill-count",)),
     "no number": (("--method.sub-skills", "many"), ("--method.sub-skills", "many")),
-    "impossible number": (("--method.sub-skills", "0"), ("sub_skills", "input_value=0", "greater than or equal to 1")),
-    "negative rate": (("--training.learning-rate", "-1"), ("learning_rate", "-1.0", "greater than 0")),
+    "impossible number": (
+        ("--method.sub-skills", "0"),
+        ("error: --method.sub-skills: got 0; input should be greater",),
+    ),
+    "negative rate": (("--training.learning-rate", "-1"), ("error: --training.learning-rate: got -1.0; input",)),
     "not a choice": (("--method.order", "third"), ("--method.order", "third", "first", "second")),
-    "more held out than there are": (("--demonstrations.held-out", "12"), ("held_out", "12", "wanted fewer")),
-    "more support than is held out": (("--evaluation.shots", "9"), ("held_out", "got 4", "wanted at least 9")),
-    "unknown task": (("--suite.train-tasks", "fly"), ("suite.train_tasks", "got fly", "reach", "push")),
-    "no task": (("--suite.train-tasks",), ("train_tasks", "input_value=()", "at least 1")),
+    "more held out than there are": (
+        ("--demonstrations.held-out", "12"),
+        ("error: --demonstrations.held-out: got 12",),
+    ),
+    "more support than is held out": (
+        ("--evaluation.shots", "9"),
+        ("error: --demonstrations.held-out: got 4; wanted at least 9",),
+    ),
+    "unknown task": (
+        ("--suite.train-tasks", "reech"),
+        ("suite.train_tasks: got reech; the nearest are reach, ", "push"),
+    ),
+    "no task": (("--suite.train-tasks",), ("error: --suite.train-tasks: got (); tuple should have at least 1",)),
     "no workers": (("--workers", "0"), ("--workers", "got 0", "at least 1")),
-    "unknown preset": (("--preset", "ml99"), ("--preset", "ml99", "ml10-paper", "ml10-quick", "ml10-smoke")),
+    "unknown preset": (("--preset", "ml10-quik"), ("got 'ml10-quik'; the nearest are ml10-quick, ", "ml10-smoke")),
+    "unknown suite": (
+        ("--preset", "smoke", "--suite", "ml1O"),
+        ("suite.name: got ml1O; the nearest are ml10, ", "ml45"),
+    ),
+    "unknown method": (("--method", "dmill"), ("method.name: got 'dmill'; the nearest are dmil, mil, ", "tracking")),
+    "two suites": (
+        ("--preset", "ml10-quick", "--suite", "kitchen"),
+        ("--suite: got kitchen with --preset ml10-quick",),
+    ),
     "no preset": (("--preset",), ("--preset",)),
 }
 LAUGHS = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}, *{a}, *{a}]\n" for a, b in pairwise("abcdefghijklmnop"))
@@ -137,10 +161,28 @@ def test_a_mistake_ends_the_program_with_exit_code_2(programs):
 @pytest.mark.parametrize(
     "name", [path.stem for path in sorted(SERVICES.glob("[a-z]*.py")) if path.stem != "checkpoints"]
 )
-def test_each_program_explains_itself(name: str, capsys: pytest.CaptureFixture[str]):
+def test_each_program_explains_itself(name: str, capsys: pytest.CaptureFixture[str], monkeypatch):
+    run = import_module(f"services.{name}").run
+    words = COMMANDS.get(f"services.{name}", f"services.{name}").removeprefix("services.")
+    program, _, rest = words.partition(" ")
+    for called, usage in (
+        ("python", f"python -m services.{words}"),
+        ("dmil", f"dmil {program.replace('_', '-')} {rest}"),
+    ):
+        monkeypatch.setattr("sys.argv", [f"/x/{called}"])
+        with suppress(SystemExit):
+            run(["--help"])
+        assert f"usage: {usage.rstrip()} " in capsys.readouterr().out
+
+
+def test_help_is_in_paragraphs_with_an_example(capsys: pytest.CaptureFixture[str], monkeypatch):
+    monkeypatch.setenv("COLUMNS", "400")
     with suppress(SystemExit):
-        import_module(f"services.{name}").run(["--help"])
-    assert f"usage: python -m services.{name} " in capsys.readouterr().out
+        run(["--help"])
+    lines = [line.strip(" │") for line in capsys.readouterr().out.splitlines()]
+    assert "dmil meta-train --preset ml10-quick" in lines
+    meaning = next(line for line in lines if line.startswith("Settings to begin with: quick"))
+    assert meaning.endswith("also with the suite's name before, as ml10-quick. (default: quick)")
 
 
 SHADOWED = (

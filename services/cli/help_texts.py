@@ -1,0 +1,115 @@
+"""What programs say of themselves and of their flags: `--help` in paragraphs, and in one line what a flag may be."""
+
+import dataclasses
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
+
+from dmil_core.errors import describe_errors
+
+COMMANDS = {
+    "services.inspect_demos": "services.collect_demos inspect",
+    "services.record_demos": "services.collect_demos record",
+    "services.verify_experts": "services.collect_demos verify",
+    "services.reporting.run_report": "services.report run",
+    "services.sweeps.compare": "services.report compare",
+    "services.reporting.sub_skill_report": "services.report sub-skills",
+    "services.reporting.video": "services.report video",
+    "services.reporting.gallery": "services.report gallery",
+    "services.sweeps.table_formats": "services.report tables",
+    "services.tracking.__main__": "services.tracking",
+}
+"""How modules are called that are no program of their own name."""
+
+
+def command_of(module: str) -> str:
+    """Return how a program is called, as ``dmil report run`` or ``python -m services.report run``."""
+    if module == "__main__":
+        path = Path(sys.argv[0])
+        module = f"services.{path.parent.name if path.stem == '__main__' else path.stem}"
+    words = COMMANDS.get(module, module)
+    if Path(sys.argv[0]).name != "dmil":
+        return f"python -m {words}"
+    program, _, rest = words.removeprefix("services.").partition(" ")
+    return f"dmil {program.replace('_', '-')} {rest}".rstrip()
+
+
+def flowing(text: str) -> str:
+    """Return a text with each paragraph on a line of its own; lines that are set in keep theirs."""
+    paragraphs = [part if part.startswith(" ") else " ".join(part.split()) for part in text.strip("\n").split("\n\n")]
+    return "\n\n".join(paragraphs)
+
+
+def flowing_registry() -> ConstructorRegistry:
+    """Return what has tyro show the texts of settings as paragraphs."""
+    registry, asked = ConstructorRegistry(), list[StructTypeInfo]()
+
+    @registry.struct_rule
+    def rule(info: StructTypeInfo) -> StructConstructorSpec | None:
+        if any(info is one for one in asked):  # by the line below: tyro's own rule is meant
+            return None
+        asked.append(info)
+        spec = ConstructorRegistry.get_struct_spec(info)
+        asked.pop()
+        if not isinstance(spec, StructConstructorSpec):
+            return None
+        fields = tuple(dataclasses.replace(field, helptext=_flown(field.helptext)) for field in spec.fields)
+        return dataclasses.replace(spec, fields=fields, instantiate=_told(spec.instantiate))
+
+    return registry
+
+
+class InvalidSettingsError(Exception):
+    """Settings that pydantic refuses; tyro would draw a box around its words."""
+
+    def __init__(self, error: ValidationError) -> None:
+        """Keep the error."""
+        super().__init__(str(error))
+        self.error = error
+
+
+def _told(make: Callable[..., Any]) -> Callable[..., Any]:
+    def told(*values: Any, **named: Any) -> Any:
+        try:
+            return make(*values, **named)
+        except ValidationError as error:
+            raise InvalidSettingsError(error) from error
+
+    return told
+
+
+def describe_flags(error: ValidationError, defaults: Any) -> str:
+    """Return what is wrong with settings, a line for each of the flags.
+
+    Args:
+        error: of one of the models in `defaults`.
+        defaults: a program's arguments, in which the sections are found by their classes.
+    """
+    section = dict(_sections(defaults, "")).get(error.title, "")
+    lines = []
+    for line in describe_errors(error).splitlines():
+        field, colon, rest = line.partition(":")
+        lines.append(f"--{section}{field.replace('_', '-')}:{rest}" if colon and " " not in field else line)
+    return "\n".join(lines)
+
+
+def _sections(value: Any, prefix: str) -> Iterator[tuple[str, str]]:
+    """Yield the class of each section of settings, and what its flags begin with."""
+    if isinstance(value, BaseModel):
+        yield type(value).__name__, prefix
+    names = type(value).model_fields if isinstance(value, BaseModel) else getattr(value, "__dataclass_fields__", ())
+    for name in names:
+        if isinstance(inner := getattr(value, name), BaseModel):
+            yield from _sections(inner, "" if name == "experiment" else f"{prefix}{name}.")
+
+
+def _flown(text: str | Callable[[], str | None] | None) -> Callable[[], str | None]:
+    def flown() -> str | None:
+        words = text() if callable(text) else text
+        return None if words is None else " ".join(words.split())
+
+    return flown
