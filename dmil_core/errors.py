@@ -89,10 +89,10 @@ def shorten(value: object) -> str:
 
 
 def nearest(name: object, known: Iterable[str]) -> str:
-    """Return the three known names that are most like a name, as a message has them in front; nothing if none is."""
+    """Return the three known names that are most like a name, as a message ends with them; nothing if none is."""
     spelled = {one.lower(): one for one in known}
     alike = get_close_matches(str(name)[:100].lower(), spelled, n=3, cutoff=ALIKE)
-    return f"the nearest are {', '.join(spelled[one] for one in alike)}; " if alike else ""
+    return f"; the nearest are {', '.join(spelled[one] for one in alike)}" if alike else ""
 
 
 def describe_errors(error: ValidationError, whole: str = "settings", separator: str = "\n") -> str:

@@ -174,8 +174,8 @@ def model_folder(name: str | Path, runs: str | Path = "runs", field: str = "name
     of_runs = [path.parent.name for path in sorted(Path(runs).glob(f"*/{FOLDER}"))]
     raise UserError(
         f"{field}: got {shorten(str(name))}; wanted the folder of a run or of a checkpoint, the name of a run in "
-        f"{runs}, or a model that comes with the project ({', '.join(shipped) or 'none here'}); "
-        f"{nearest(name, [*of_runs, *shipped])}an address is models:/NAME@champion"
+        f"{runs}, or a model that comes with the project ({', '.join(shipped) or 'none here'}), or "
+        f"models:/NAME@champion{nearest(name, [*of_runs, *shipped])}"
     )
 
 

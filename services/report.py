@@ -37,7 +37,7 @@ def run(arguments: Sequence[str]) -> None:
     if not arguments or arguments[0] not in KINDS:
         got = arguments[0] if arguments else "nothing"
         raise UserError(
-            f"report: got {got}; {nearest(got, KINDS)}wanted one of {', '.join(KINDS)}, each with a --help of its own"
+            f"report: got {got}; wanted one of {', '.join(KINDS)}, each with a --help of its own{nearest(got, KINDS)}"
         )
     import_module(KINDS[arguments[0]]).run(arguments[1:])
 

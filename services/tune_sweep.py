@@ -141,8 +141,8 @@ def _begun(args: Arguments) -> SweepFolder:
     file = CONFIGS / f"{args.sweep}.yaml" if args.sweep in known else Path(args.sweep)
     if not file.exists():
         raise UserError(
-            f"SWEEP: got {args.sweep}; {nearest(file.stem, known)}wanted a readable YAML file, or one of "
-            f"{', '.join(known)}"
+            f"SWEEP: got {args.sweep}; wanted a readable YAML file, or one of "
+            f"{', '.join(known)}{nearest(file.stem, known)}"
         )
     try:
         sweep = _read(file).at(args.preset, args.suites or (), args.seeds or ())

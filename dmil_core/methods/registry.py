@@ -56,7 +56,7 @@ def method_type(name: object) -> type[Method[Any]]:
         if name in registered:
             return _loaded(registered[name])
     known = method_names()
-    raise UserError(f"method.name: got {shorten(name)}; {nearest(name, known)}wanted one of {', '.join(known)}")
+    raise UserError(f"method.name: got {shorten(name)}; wanted one of {', '.join(known)}{nearest(name, known)}")
 
 
 def config_type(name: object) -> type[MethodConfig]:

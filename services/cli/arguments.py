@@ -122,6 +122,6 @@ def main() -> None:
     for program, purpose in PROGRAMS.items():
         print(f"  {program:15}{purpose}")
     if name not in ("--help", "-h"):
-        wanted = f"{nearest(name, PROGRAMS)}wanted one of {', '.join(PROGRAMS)}"
+        wanted = f"wanted one of {', '.join(PROGRAMS)}{nearest(name, PROGRAMS)}"
         print(f"\nerror: got the program {name!r}; {wanted}", file=sys.stderr)
         sys.exit(2)

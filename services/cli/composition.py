@@ -51,8 +51,8 @@ def config_from(
     named, _, size = preset.rpartition("-")
     if size not in BASE_PRESETS or (named and preset not in PRESETS):
         raise UserError(
-            f"--preset: got {preset!r}; {nearest(preset, [*BASE_PRESETS, *PRESETS])}wanted {', '.join(BASE_PRESETS)}, "
-            f"with --suite, or one of {', '.join(PRESETS)}"
+            f"--preset: got {preset!r}; wanted {', '.join(BASE_PRESETS)}, with --suite, or one of "
+            f"{', '.join(PRESETS)}{nearest(preset, [*BASE_PRESETS, *PRESETS])}"
         )
     if suite is not None and named and suite.lower() != named.lower():
         raise UserError(

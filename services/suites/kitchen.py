@@ -173,7 +173,7 @@ class KitchenSuite:
         name = DEFAULT_SPLIT if config.name.lower() == "kitchen" else config.name.lower()
         if name not in SPLITS:
             raise UserError(
-                f"suite.name: got {config.name}; {nearest(config.name, SPLITS)}wanted kitchen or {', '.join(SPLITS)}"
+                f"suite.name: got {config.name}; wanted kitchen or {', '.join(SPLITS)}{nearest(config.name, SPLITS)}"
             )
         if config.protocol != "paper" or not config.goal_visible:
             field = "goal_visible: got False" if config.protocol == "paper" else f"protocol: got {config.protocol}"
@@ -231,8 +231,8 @@ def sub_tasks_of(task: str, field: str = "task") -> tuple[str, ...]:
     chain = tuple(task.split("-"))
     if not set(chain) <= set(NAMES) or len(set(chain)) < len(chain):
         raise UserError(
-            f"{field}: got {task}; {nearest(task, NAMES)}wanted some of {', '.join(NAMES)}, each at most once, joined "
-            "by hyphens"
+            f"{field}: got {task}; wanted some of {', '.join(NAMES)}, each at most once, joined by hyphens"
+            f"{nearest(task, NAMES)}"
         )
     return chain
 

@@ -127,8 +127,8 @@ class MetaWorldSuite:
             known = ", ".join(name for name in SPLITS if not name.startswith("ML1-"))
             tasks = ", ".join(task for task in TASKS if f"ML1-{task}" in SPLITS)
             raise UserError(
-                f"suite.name: got {config.name}; {nearest(config.name, SPLITS)}wanted {known}, kitchen-topburner, "
-                f"-microwave, -kettle or -slide, or ML1- and one of {tasks}"
+                f"suite.name: got {config.name}; wanted {known}, kitchen-topburner, -microwave, -kettle or -slide, or "
+                f"ML1- and one of {tasks}{nearest(config.name, SPLITS)}"
             )
         train, test = SPLITS[name]
         self.name = name if config.train_tasks is config.test_tasks is None else f"{name}-part"
@@ -137,8 +137,8 @@ class MetaWorldSuite:
         for field, tasks in (("train_tasks", self.train_tasks), ("test_tasks", self.test_tasks)):
             if unknown := [task for task in tasks if task not in TASKS]:
                 raise UserError(
-                    f"suite.{field}: got {', '.join(unknown)}; {nearest(unknown[0], TASKS)}wanted some of "
-                    f"{', '.join(TASKS)}"
+                    f"suite.{field}: got {', '.join(unknown)}; wanted some of {', '.join(TASKS)}"
+                    f"{nearest(unknown[0], TASKS)}"
                 )
         self.horizon = config.horizon or HORIZONS[config.protocol]
         self._goal_visible = config.goal_visible

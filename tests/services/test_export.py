@@ -67,7 +67,7 @@ def test_models_are_found_by_name_and_are_what_their_cards_tell_of(tmp_path: Pat
         for row in rows:
             successes = f"{round(row.success_rate * row.episodes)}/{row.episodes}"
             assert f"| {row.shots} | {successes} | {row.success_rate:.3f} |" in (path / "README.md").read_text()
-    with pytest.raises(UserError, match=r"got 'ml46'.*\(ml10, ml45.*the nearest are ml45, ml10"):
+    with pytest.raises(UserError, match=r"got 'ml46'.*\(ml10, ml45.*; the nearest are ml45, ml10"):
         dmil.load("ml46")
 
 
