@@ -180,7 +180,7 @@ def test_going_on_with_other_settings_is_refused(copied_run, train, flag: tuple[
         "a GPU by number",
         "two GPUs",
         "no such path",
-    ],  # fmt: skip
+    ],
 )
 def test_a_run_that_cannot_be_is_refused(copied_run, complaint, arguments, words):
     copied_run(0)
