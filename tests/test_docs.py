@@ -14,6 +14,7 @@ import pytest
 
 from services.cli.composition import config_from
 from services.cli.yaml_files import read_yaml
+from services.suites.rendering import RenderingError, working_backend
 from services.sweeps.settings import Sweep
 from tests.deploy.command_lines import refused
 from tests.dmil_core.old_models import FOLDER
@@ -174,13 +175,17 @@ def test_the_site_is_whole_and_loads_nothing_from_a_network(tmp_path: Path):
 
 @pytest.mark.thorough
 def test_the_notebook_runs_and_is_committed_as_it_ran(tmp_path: Path):
-    notebook, executed = PROJECT / "docs" / "first_run.ipynb", tmp_path / "executed.ipynb"
-    code = "from nbclient.cli import main; main()"
-    subprocess.run(
-        [sys.executable, "-c", code, f"--output={executed.with_suffix('')}", str(notebook)], cwd=PROJECT, check=True
-    )
-    committed, ran = (json.loads(path.read_text("utf-8"))["cells"] for path in (notebook, executed))
-    kinds = [[output["output_type"] for output in cell.get("outputs", [])] for cell in committed]
-    assert kinds == [[output["output_type"] for output in cell.get("outputs", [])] for cell in ran]
-    assert "image/jpeg" in next(cell for cell in reversed(committed) if cell.get("outputs"))["outputs"][-1]["data"]
-    assert notebook.stat().st_size < 100_000
+    notebook = json.loads((PROJECT / "docs" / "first_run.ipynb").read_text("utf-8"))
+    film = notebook["cells"][-2]["outputs"][-1]["data"]
+    assert 10_000 < len(film["image/jpeg"]) < 100_000
+    try:
+        working_backend()
+    except RenderingError:
+        del notebook["cells"][-2]
+    (copy := tmp_path / "copy.ipynb").write_text(json.dumps(notebook))
+    command = [sys.executable, "-c", "from nbclient.cli import main; main()", "--inplace", str(copy)]
+    subprocess.run(command, cwd=PROJECT, check=True)
+    ran = json.loads(copy.read_text("utf-8"))["cells"]
+    for before, after in zip(notebook["cells"], ran, strict=True):
+        kinds = [[output["output_type"] for output in cell.get("outputs", [])] for cell in (before, after)]
+        assert kinds[0] == kinds[1]
