@@ -103,3 +103,14 @@ def test_faults(tmp_path: Path) -> None:
     assert (found["kills"], found["equal"], found["lost"], found["different"]) == (2, 2, 0, 0)
     assert found["seconds"] > 0
     assert set(found["cost"]) == {"worker", "all workers", "learner", "driver"}
+
+
+@pytest.mark.thorough
+def test_serving(tmp_path: Path) -> None:
+    few = ["--rate", "20", "--seconds", "2", "--mixed-seconds", "15", "--kill-seconds", "5"]
+    act, loop, mixed = rows_of("serving", *few, folder=tmp_path)
+    assert (act["what"], loop["what"], mixed["what"]) == ("act", "control loop", "mixed, 15 s")
+    assert act["right"] > 20
+    assert mixed["killed"] >= 1
+    assert act["wrong"] == loop["wrong"] == mixed["wrong"] == 0
+    assert 0 < loop["p50_ms"] <= loop["p99_ms"]
