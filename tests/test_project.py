@@ -165,7 +165,6 @@ BY_HAND = {
     "services/reporting/film.py": {"made.read_bytes"},  # out of a temporary folder of its own
     "services/storage/private.py": {"shutil.rmtree", "tempfile.mkdtemp", "folder.mkdir", "path.unlink", "os.open"},
     "services/storage/remote.py": {"self._files.makedirs", "self._files.open"},
-    "services/storage/run_folders.py": {"folder.mkdir"},  # takes a name
 }
 """Who else does it, and what."""
 
