@@ -31,7 +31,8 @@ from services.serving.bodies import (
 )  # fmt: skip
 from services.serving.guard import Guard
 from services.serving.page import HEADERS, page
-from services.serving.service import Arrays, BusyError, FieldError, Held, MissingError, Service
+from services.serving.policies import Arrays, FieldError
+from services.serving.service import BusyError, Held, MissingError, Service
 
 MOST_UNPACKED = 8
 """Bytes of the arrays in an npz file for each byte that a body may have."""
