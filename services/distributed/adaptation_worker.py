@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 
 from dmil_core.demonstrations import Demonstration
-from dmil_core.devices import USUAL, Compute, describe
+from dmil_core.devices import USUAL, Compute, computing_on, describe
 from dmil_core.methods.base import MetaLearner
 from dmil_core.networks import unflatten
 from dmil_core.outer_loop import NonfiniteSlot, add, group_gradient
@@ -83,7 +83,8 @@ class AdaptationWorker:
             WorkError: for a Python error in one of the slots.
         """
         started = time.perf_counter()
-        unflattened = unflatten(torch.from_numpy(from_chunks(parameters)).to(self._device), self._shapes)
+        with computing_on(self._device):
+            unflattened = unflatten(torch.from_numpy(from_chunks(parameters)).to(self._device), self._shapes)
         results = [
             group_gradient(
                 self._method,

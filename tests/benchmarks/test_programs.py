@@ -30,6 +30,15 @@ def test_meta_gradient(tmp_path: Path) -> None:
         assert row["relative_error"] < 1e-5
 
 
+@pytest.mark.thorough
+def test_device(tmp_path: Path) -> None:
+    rows = rows_of("device", "--sizes", "quick", "--rounds", "1", "--no-whole", folder=tmp_path)
+    assert [(row["device"], row["path"]) for row in rows][:2] == [("cpu", "loop"), ("cpu", "batched")]
+    for row in rows:
+        assert row["ms_an_iteration"] == pytest.approx(10 * row["ms_a_slot"])
+        assert 0 < row["roofline_share"] < 1
+
+
 def test_adaptation(tmp_path: Path) -> None:
     rows = rows_of("adaptation", "--fine-tuning-steps", "2", "--rounds", "1", folder=tmp_path)
     *ours_and_reference, mil = rows

@@ -7,14 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from dmil_core.devices import Compute
 from dmil_core.outer_loop import groups
 from services.demonstrations.store import DemoStore
 from services.distributed.adaptation_worker import AdaptationWorker
 from services.distributed.chunking import CHUNK_LENGTH, from_chunks, to_chunks
 from services.distributed.learner import Learner
 from services.distributed.ray_meta_training import RayMetaTraining
-from services.distributed.ray_runner import open_runner
+from services.distributed.ray_runner import RunnerKind, open_runner
 from services.distributed.runner import Runner
 from services.distributed.timing import Span, Timing
 from services.evaluation.results import EpisodeResult
@@ -42,6 +44,31 @@ def test_any_number_of_workers_ends_with_the_same_bits(
     plan = plan_of(experiment, data)
     with open_runner("ray", experiment.suite, workers):
         assert_same_bits(follow(RayMetaTraining(plan, workers, fan_in)), wanted)
+
+
+@pytest.mark.usefixtures("joined")
+@pytest.mark.parametrize(
+    "compute",
+    [
+        pytest.param(Compute("cpu", "batched"), marks=pytest.mark.thorough),
+        pytest.param(
+            Compute("cuda"),
+            marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU here")],
+        ),
+    ],
+    ids=["batched", "several workers on one card"],
+)
+def test_a_group_at_once_gives_the_same_bits_with_any_number_of_workers(
+    config, store: DemoStore, data, compute: Compute
+):
+    experiment, courses = Experiment(training(config, 6, 2), store), []
+    runners: list[tuple[RunnerKind, int | None]] = [("local", None), ("ray", 1), ("ray", 3)]
+    for kind, workers in runners:
+        with open_runner(kind, experiment.suite, workers, compute) as runner:
+            courses.append(follow(runner.meta_train(plan_of(experiment, data))))
+    assert np.isfinite(courses[0].states[-1].parameters).all()
+    for course in courses[1:]:
+        assert_same_bits(course, courses[0])
 
 
 @pytest.mark.thorough
