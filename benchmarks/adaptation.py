@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from benchmarks.harness import BenchmarkArguments, Row, alternate, lay_out, main
+from benchmarks.harness import BenchmarkArguments, Ratio, Row, alternate, lay_out, main
 from benchmarks.masked_reference import MaskedReference
 from benchmarks.workload import ACTION_DIM, OBS_DIM, as_in_a_run, draw_parameters, draw_steps, settings
 from dmil_core.demonstrations import Demonstration, Normalisation
@@ -119,11 +119,15 @@ def _measure(comparison: Comparison, rounds: int) -> dict[str, Any]:
 
     timed = alternate({name: repeated(function) for name, function in comparison.rivals.items()}, rounds)
     seconds = {name: median(spent) / comparison.times for name, spent in timed.items()}
+    ratio = Ratio.of(timed["twin"], timed["ours"]) if "twin" in timed else None
     return {
         "what": comparison.name,
         "seconds": seconds["ours"],
         "twin_seconds": seconds.get("twin"),
-        "ratio": seconds["twin"] / seconds["ours"] if "twin" in seconds else None,
+        "least_seconds": min(timed["ours"]) / comparison.times,
+        "most_seconds": max(timed["ours"]) / comparison.times,
+        "ratio": ratio and ratio.median,
+        "ratio_spread": ratio and [ratio.least, ratio.most],
         "floor_seconds": seconds.get("floor"),
         "target_seconds": comparison.target,
         "rounds": rounds,
@@ -137,7 +141,7 @@ def _cells(row: Row) -> dict[str, str]:
         "ours": _describe(row["seconds"]),
         "at most": f"{_describe(row['target_seconds'])} ({verdict})",
         "twin": _describe(row["twin_seconds"]),
-        "faster": f"{row['ratio']:.2f}x" if row["ratio"] else "",
+        "faster": str(Ratio(row["ratio"], *row["ratio_spread"])) if row["ratio_spread"] else "",
         "reading the weights": _describe(row["floor_seconds"]),
     }
 

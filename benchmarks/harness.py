@@ -7,7 +7,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn, TypeAlias, TypeVar
+from statistics import median
+from typing import Any, NamedTuple, NoReturn, TypeAlias, TypeVar
 
 from rich.table import Table
 
@@ -69,6 +70,31 @@ def alternate(
             functions[name]()
             seconds[name].append(clock() - start)
     return seconds
+
+
+DISAGREEING = 1.5
+"""Where the ratios of the rounds lie further apart than so many times, other work was beside it, and none is given."""
+
+
+class Ratio(NamedTuple):
+    """How many times as long one function took as another, round by round."""
+
+    median: float | None
+    """None if the rounds disagree by more than `DISAGREEING` times."""
+    least: float
+    most: float
+
+    @classmethod
+    def of(cls, slower: Sequence[float], faster: Sequence[float]) -> "Ratio":
+        """Compare the seconds of calls that took turns."""
+        rounds = [slow / fast for slow, fast in zip(slower, faster, strict=True)]
+        agree = max(rounds) <= DISAGREEING * min(rounds)
+        return cls(median(rounds) if agree else None, min(rounds), max(rounds))
+
+    def __str__(self) -> str:
+        """Return the median with the least and the most, or why there is none."""
+        spread = f"{self.least:.2f} to {self.most:.2f}"
+        return f"the rounds disagree, {spread}" if self.median is None else f"{self.median:.2f}x ({spread})"
 
 
 def lay_out(title: str, rows: Sequence[Mapping[str, str]], words: int = 1, **options: Any) -> Table:

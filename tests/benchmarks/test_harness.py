@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from benchmarks.harness import alternate, write_rows
+from benchmarks.harness import Ratio, alternate, write_rows
 
 
 def test_rivals_take_turns_and_every_other_round_goes_backwards():
@@ -27,6 +27,13 @@ def test_preparation_comes_before_each_call_and_is_not_timed(monkeypatch: pytest
     seconds = alternate(rivals, rounds=2, prepare={"a": lambda: calls.append("-")})
     assert "".join(calls) == "-|a||b||b|-|a|"
     assert seconds == {"a": [2, 2], "b": [2, 2]}
+
+
+def test_a_ratio_whose_rounds_disagree_is_refused():
+    assert Ratio.of([3.0, 4.0, 2.9], [1.0, 1.0, 1.0]) == (3.0, 2.9, 4.0)
+    refused = Ratio.of([3.0, 99.0], [1.0, 1.0])
+    assert refused.median is None
+    assert str(refused) == "the rounds disagree, 3.00 to 99.00"
 
 
 def test_rows_are_read_back_as_written(tmp_path):

@@ -24,6 +24,7 @@ def test_meta_gradient(tmp_path: Path) -> None:
     assert [(row["size"], row["order"], row["k"]) for row in rows] == [("quick", "second", 2), ("quick", "second", 3)]
     for row in rows:
         assert row["ratio"] == pytest.approx(row["twin_seconds"] / row["seconds"])
+        assert row["ratio_spread"] == [row["ratio"]] * 2
         assert row["roofline_share"] > 0
         assert 100 < row["peak_mb"] < 1500
         assert row["forwards"] == pytest.approx(4 * row["k"] + 64, rel=0.1), "the count of work of own states only"

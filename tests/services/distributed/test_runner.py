@@ -62,7 +62,7 @@ def test_a_group_at_once_gives_the_same_bits_with_any_number_of_workers(
     config, store: DemoStore, data, compute: Compute
 ):
     experiment, courses = Experiment(training(config, 6, 2), store), []
-    runners: list[tuple[RunnerKind, int | None]] = [("local", None), ("ray", 1), ("ray", 3)]
+    runners: list[tuple[RunnerKind, int | None]] = [("local", None), ("ray", 3)]
     for kind, workers in runners:
         with open_runner(kind, experiment.suite, workers, compute) as runner:
             courses.append(follow(runner.meta_train(plan_of(experiment, data))))
