@@ -77,7 +77,10 @@ def parse(program: type[T], description: str, arguments: Sequence[str], defaults
     except InvalidSettingsError as error:
         raise UserError(describe_flags(error.error, defaults)) from error
     paths = {name: at_home(value) for name, value in vars(read).items() if isinstance(value, Path)}
-    return dataclasses.replace(read, **paths)  # type: ignore[type-var]  every program's is a dataclass
+    texts = [field.name for field in dataclasses.fields(program) if field.type == str | None]  # type: ignore[arg-type]
+    given = vars(peek(arguments, **dict.fromkeys(texts, str)))  # tyro takes the text None for no text
+    told = {name: text for name, text in given.items() if text is not None}
+    return dataclasses.replace(read, **paths, **told)  # type: ignore[type-var]  every program's is a dataclass
 
 
 def exit_code(program: Callable[[Sequence[str]], None], arguments: Sequence[str]) -> int:

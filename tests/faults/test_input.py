@@ -3,6 +3,7 @@
 import json
 import unicodedata
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import UserError
 from dmil_core.methods.registry import OURS, config_type
 from services import evaluate, inspect_demos, meta_train
-from services.cli.arguments import peek
+from services.cli.arguments import parse, peek
 from services.cli.composition import EARLY, config_from
 from services.demonstrations.external import places_of
 from services.demonstrations.store import data_root
@@ -117,6 +118,19 @@ def test_paths_of_data_sets_have_one_reading(source: str, places: dict[str, str]
 def test_what_has_no_reading_is_refused(source: str):
     with pytest.raises(UserError, match=r"demonstrations\.source: got"):
         places_of(source)
+
+
+@dataclass(frozen=True)
+class Named:
+    name: str | None = None
+    """A text."""
+    count: int | None = 3
+    """A number."""
+
+
+def test_none_is_a_name_and_no_number():
+    assert parse(Named, "", ["--name", "None", "--count", "None"], Named()) == Named("None", None)
+    assert parse(Named, "", [], Named()) == Named()
 
 
 def test_a_list_is_given_by_repeating_the_flag():
