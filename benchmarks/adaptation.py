@@ -3,8 +3,14 @@
 One demonstration of 100 steps, K = 3, width 512. An action reads the weights of the high level and of one sub-skill,
 which do not fit a core's own cache: the time that reading as many bytes takes, and nothing else, is its floor. MIL's
 action reads the decoder's weights and the encoder's view of the demonstration; it has no reference here.
+
+What somebody does in Python is timed too, with the model ml10 that comes with the project (K = 3, width 256): the
+import of `dmil_core` in a process of its own, `load`, an action, and adaptation by 50 steps to one demonstration. These
+are the least times of the rounds: promises of a machine that does nothing else.
 """
 
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -22,6 +28,7 @@ from dmil_core.methods.dmil.adaptation import Hierarchy, adapt
 from dmil_core.methods.dmil.policy import DmilPolicy
 from dmil_core.methods.mil.config import MilConfig
 from dmil_core.methods.mil.method import Mil
+from dmil_core.model import SHIPPED, load
 from dmil_core.seeding import named_rng
 from services.cli.progress import console
 
@@ -56,8 +63,28 @@ def run(args: Arguments) -> Sequence[Row]:
     """Run the benchmark."""
     torch.set_num_threads(1)
     rows = [_measure(comparison, args.rounds) for comparison in (*_dmil(args), _mil(args))]
+    rows += [_measure(comparison, args.rounds, min) for comparison in _in_python(args)]
     console.print(lay_out("adaptation and acting on one core", [_cells(row) for row in rows]))
     return rows
+
+
+def _in_python(args: Arguments) -> list[Comparison]:
+    model, importing = load(SHIPPED / "ml10"), [sys.executable, "-c", "import dmil_core; dmil_core.load"]
+    rng, observed = named_rng(0, "benchmark demonstration"), model.checkpoint.manifest.observed
+    assert observed is not None
+    states = rng.uniform(observed.low, observed.high, (100, len(observed)))  # as meta-training has seen them
+    demonstrations = [(states, draw_steps(0, 1, 100).actions.numpy().clip(-1, 1))]
+    policy = model.adapt(demonstrations, steps=0)
+
+    def adapting() -> object:
+        return model.adapt(demonstrations, steps=args.fine_tuning_steps)
+
+    return [
+        Comparison("import dmil_core", {"ours": lambda: subprocess.run(importing, check=True)}, 1, 1.5),
+        Comparison("load ml10", {"ours": lambda: load(SHIPPED / "ml10")}, 1, 0.2),
+        Comparison("ml10: policy(observation)", {"ours": lambda: policy(states[0])}, CALLS, 150e-6),
+        Comparison(f"ml10: adapt, 1 shot, {args.fine_tuning_steps} steps", {"ours": adapting}, 1, 0.5),
+    ]
 
 
 def _mil(args: Arguments) -> Comparison:
@@ -111,14 +138,16 @@ def _dmil(args: Arguments) -> list[Comparison]:
     return [adapting, acting(1, 150e-6), acting(20, 500e-6)]
 
 
-def _measure(comparison: Comparison, rounds: int) -> dict[str, Any]:
-    """Return the row of one comparison; seconds are those of one adaptation or one action."""
+def _measure(
+    comparison: Comparison, rounds: int, middle: Callable[[Sequence[float]], float] = median
+) -> dict[str, Any]:
+    """Return the row of one comparison; seconds are those of one adaptation or one action, the `middle` of rounds."""
 
     def repeated(function: Callable[[], object]) -> Callable[[], object]:
         return lambda: [function() for _ in range(comparison.times)]
 
     timed = alternate({name: repeated(function) for name, function in comparison.rivals.items()}, rounds)
-    seconds = {name: median(spent) / comparison.times for name, spent in timed.items()}
+    seconds = {name: middle(spent) / comparison.times for name, spent in timed.items()}
     ratio = Ratio.of(timed["twin"], timed["ours"]) if "twin" in timed else None
     return {
         "what": comparison.name,

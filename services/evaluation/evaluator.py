@@ -12,7 +12,7 @@ from dmil_core.checkpoint import Checkpoint, CheckpointError, iteration_of
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.files import check_folder, inside
-from dmil_core.settings import sub_skills_of
+from dmil_core.settings import MethodConfig, sub_skills_of
 from services.cli.live_view import Tally
 from services.demonstrations.store import TaskDemonstrations
 from services.distributed.failures import keeping_failures
@@ -177,6 +177,11 @@ class Evaluations:
         self._under_way: tuple[Checkpoint, Simulation[AdaptationOutcome]] | None = None
         self.latest: dict[str, Any] = {}
         """What the last one came to, as fields of `Status`: the ``success``, and ``after`` how many iterations."""
+
+    @property
+    def method(self) -> MethodConfig:
+        """The settings of the method that is evaluated."""
+        return self._evaluator.config.method
 
     def is_due(self, iteration: int) -> bool:
         """Tell whether the checkpoint of an iteration is evaluated on the way; the last one is when all is over."""

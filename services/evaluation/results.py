@@ -60,6 +60,8 @@ class EpisodeResult(_Row):
     steps: int
     sub_skill_steps: tuple[int, ...]
     """How many steps each sub-skill acted."""
+    diverged: bool = False
+    """Whether it ended because the policy's action was not finite: a failure."""
     fault: int | None = Field(default=None, exclude_if=lambda fault: fault is None)
     """The first observation that is not finite: the simulator's fault, for which the episode does not count."""
 

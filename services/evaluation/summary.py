@@ -24,10 +24,18 @@ BEST = 5
 """So many of a task's episodes count in the authors' own figure for the kitchen."""
 COLLAPSED = 0.99
 """A sub-skill with more of the states than this leaves nothing to the others."""
-AGAINST_COLLAPSE = (
-    "another --seed, a smaller --training.learning-rate or --method.output-scale may help, and "
-    "--method.continuity-weight 0"
-)
+
+
+def against_collapse(method: MethodConfig) -> str:
+    """Return what may help where one sub-skill takes nearly all states, without what is so already."""
+    proposed = {
+        "balance": ("none", "--method.balance sinkhorn"),
+        "labels_until": (0, "--method.labels-until above 0"),
+    }
+    settings = [flag for name, (value, flag) in proposed.items() if getattr(method, name, None) == value]
+    if getattr(method, "continuity_weight", 0) > 0:
+        settings.append("--method.continuity-weight 0")
+    return ", ".join([*settings, "another --seed or a smaller --training.learning-rate may help"])
 
 
 class Evaluation(NamedTuple):
@@ -74,6 +82,8 @@ class SummaryRow(BaseModel):
     """In suites that count sub-tasks."""
     paper: Published | None
     """The paper's success rate for DMIL, or its score where there are scores."""
+    diverged: int = 0
+    """Adaptations after which an action was not finite: such episodes end there, as failures."""
 
 
 class SubSkillShares(BaseModel):
@@ -110,6 +120,8 @@ class Summary(BaseModel):
     """Of each task, those held out among them; older files have none."""
     controls: list[ControlRow] = []
     """Beside the run on meta-testing tasks, where the settings ask for any."""
+    against_collapse: str = ""
+    """What may help where one sub-skill takes nearly all states; older files have nothing."""
     faults: str = ""
     """In words, the episodes that do not count because the simulator gave numbers that are not finite."""
 
@@ -117,6 +129,16 @@ class Summary(BaseModel):
     def collapsed(self) -> bool:
         """Whether one of several sub-skills takes nearly all states."""
         return any(len(use.share) > 1 and max(use.share) > COLLAPSED for use in self.sub_skills.values())
+
+
+def diverged_of(summary: Summary) -> str:
+    """Return in words how many adaptations diverged; nothing where none did."""
+    if not (count := sum(row.diverged for row in summary.rows)):
+        return ""
+    return (
+        f"{count} adaptation{'s' if count > 1 else ''} diverged: an action was not finite, and the episode counts as a "
+        "failure; fewer --evaluation.fine-tuning-steps or a smaller --evaluation.learning-rate may help"
+    )
 
 
 def faults_of(episodes: Sequence[EpisodeResult]) -> str:
@@ -156,6 +178,7 @@ def summary_rows(episodes: Sequence[EpisodeResult], best_score: int, method: Met
                 per_task=per_task,
                 score=_score(of_group, best_score) if best_score > 1 else None,
                 paper=figure_of(method, suite, split, shots),
+                diverged=len({(row.task, row.draw) for row in of_group if row.diverged}),
             )
         )
     return sorted(rows, key=lambda cell: (cell.suite, cell.split == "meta-testing", cell.shots))
@@ -199,6 +222,7 @@ def rates(rows: Sequence[SummaryRow], use: Mapping[Split, SubSkillShares]) -> di
     metrics: dict[str, float] = {}
     for cell in rows:
         name, score = f"{cell.split}/{cell.shots}-shot", cell.score
+        metrics |= {f"diverged/{name}": float(cell.diverged)} if cell.diverged else {}
         means: dict[str, float | None] = {"success_rate": cell.success_rate, "success_rate_low": cell.low}
         means |= {"success_rate_high": cell.high, "episodes": float(cell.episodes)}
         if score is not None:
@@ -236,6 +260,7 @@ def summarise(
         failed_attempts=evaluation.failed_attempts,
         demonstrations=evaluation.demonstrations,
         controls=list(controls),
+        against_collapse=against_collapse(config.method),
         faults=faults_of(evaluation.episodes),
     )
 
@@ -274,8 +299,8 @@ def table_markdown(summary: Summary) -> str:
     if summary.controls:
         rows = (row.fields for row in summary.controls)
         lines += ["", *markdown_rows(HEAD, rows), "", *(f"{sentence}." for sentence in said(summary.controls))]
-    faults = f"{for_markdown(summary.faults)}.\n\n" if summary.faults else ""
-    return f"Success rates of {for_markdown(described(summary))}.\n\n{faults}" + "\n".join(lines) + "\n"
+    warnings = "".join(f"{for_markdown(words)}.\n\n" for words in (summary.faults, diverged_of(summary)) if words)
+    return f"Success rates of {for_markdown(described(summary))}.\n\n{warnings}" + "\n".join(lines) + "\n"
 
 
 def described(summary: Summary) -> str:
@@ -286,7 +311,7 @@ def described(summary: Summary) -> str:
 
 def headline(summary: Summary) -> list[list[str]]:
     """Return the head and the rows of the table; columns that no row has anything in are left out."""
-    columns = ["suite", "split", "shots", "successes", "success rate", "95% interval"]
+    columns = ["suite", "split", "shots", "successes", "success rate", "95% interval", "diverged adaptations"]
     rows = [_fields(cell) for cell in summary.rows]
     best = max((cell.score.best for cell in summary.rows if cell.score), default=1)
     tables = {cell.paper.table for cell in summary.rows if cell.paper}
@@ -303,7 +328,7 @@ def without_empty_columns(head: Sequence[str], rows: Sequence[Sequence[str]]) ->
 def _fields(cell: SummaryRow) -> list[str]:
     successes = f"{round(cell.success_rate * cell.episodes)}/{cell.episodes}"
     fields = [cell.suite, cell.split, str(cell.shots), successes, f"{cell.success_rate:.3f}"]
-    fields.append(interval_text(cell.low, cell.high, 3))
+    fields += [interval_text(cell.low, cell.high, 3), str(cell.diverged or "")]
     if (score := cell.score) is None:
         fields += ["", "", ""]
     else:

@@ -12,13 +12,14 @@ import numpy as np
 from dmil_core.checkpoint import Checkpoint, Manifest
 from dmil_core.errors import RunError
 from dmil_core.outer_loop import OuterState
+from dmil_core.settings import MethodConfig
 from services.cli.live_view import Status
 from services.cli.progress import Bar, aside
 from services.distributed.failures import keeping_failures
 from services.distributed.metrics import CHECKPOINT_TIME, SPOOL_RECORDS
 from services.distributed.runner import Plan, Runner
 from services.evaluation.evaluator import Evaluations
-from services.evaluation.summary import AGAINST_COLLAPSE, COLLAPSED
+from services.evaluation.summary import COLLAPSED, against_collapse
 from services.experiments.iteration_metrics import iteration_metrics, nonfinite_message, shares_of, status_of
 from services.storage.checkpoints import Checkpoints
 from services.storage.run_folders import resume_command
@@ -98,9 +99,9 @@ class CheckpointWriter:
 class CollapseWatch:
     """Notices that one sub-skill takes nearly all states for long, and warns once."""
 
-    def __init__(self) -> None:
+    def __init__(self, method: MethodConfig) -> None:
         """Start without any iterations."""
-        self._iterations, self._has_warned = 0, False
+        self._method, self._iterations, self._has_warned = method, 0, False
 
     def update(self, iteration: int, metrics: Mapping[str, float]) -> str | None:
         """Return the warning, if it is due after an iteration with these metrics."""
@@ -112,7 +113,7 @@ class CollapseWatch:
         self._has_warned = True
         return (
             f"sub-skill {shares.argmax()} has taken over {COLLAPSED:.0%} of the states for {COLLAPSED_ITERATIONS} "
-            f"iterations, up to {iteration}: the hierarchy is not used; {AGAINST_COLLAPSE}"
+            f"iterations, up to {iteration}: the hierarchy is not used; {against_collapse(self._method)}"
         )
 
 
@@ -123,7 +124,7 @@ class IterationLog:
         """Start without any iterations."""
         self._runner, self._tracker, self._evaluations = runner, tracker, evaluations
         self._recent: deque[Mapping[str, float]] = deque(maxlen=RECENT)
-        self._collapse, self._device = CollapseWatch(), "cpu"
+        self._collapse, self._device = CollapseWatch(evaluations.method), "cpu"
 
     def add(self, iteration: int, metrics: Mapping[str, float], device: str = "cpu") -> None:
         """Record an iteration's metrics, without those that are not finite, and what computed it if not the CPU."""

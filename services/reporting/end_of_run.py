@@ -8,9 +8,9 @@ from dmil_core.files import write_file
 from services.cli.progress import console
 from services.evaluation.controls import said
 from services.evaluation.summary import (
-    AGAINST_COLLAPSE,
     Summary,
     control_table,
+    diverged_of,
     rates,
     table,
     table_markdown,
@@ -59,8 +59,10 @@ def show(summary: Summary, addresses: Sequence[str] = ()) -> None:
         )
     if summary.collapsed:
         console.print(
-            f"warning: one sub-skill takes nearly all states, so the hierarchy is not used; {AGAINST_COLLAPSE}"
+            f"warning: one sub-skill takes nearly all states, so the hierarchy is not used; {summary.against_collapse}"
         )
+    if diverged := diverged_of(summary):
+        console.print(f"warning: {diverged}")
     if summary.faults:
         console.print(f"warning: {summary.faults}")
     if failed := {task: count for task, count in summary.failed_attempts.items() if count}:

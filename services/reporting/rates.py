@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dmil_core.statistics import Mean, interval_text, mean_score, success_rate
 from services.evaluation.controls import HEAD, said
 from services.evaluation.results import EpisodeResult
-from services.evaluation.summary import AGAINST_COLLAPSE, described, headline
+from services.evaluation.summary import against_collapse, described, diverged_of, headline
 from services.experiments.finished_run import FinishedRun
 from services.reporting.drawing import INK, Picture, colour_of, panels, to_picture
 from services.reporting.page import DataTable, Part, Prose, Section
@@ -39,11 +39,13 @@ def table_of_all(finished: FinishedRun) -> list[Part]:
     parts: list[Part] = [Prose(f"Success rates of {described(summary)}.")]
     if summary.faults:
         parts.append(Prose(f"Warning: {summary.faults}."))
+    if diverged := diverged_of(summary):
+        parts.append(Prose(f"Warning: {diverged}."))
     if summary.collapsed:
         parts.append(
             Prose(
                 "Warning: one sub-skill takes nearly all states, so the hierarchy is not used, whatever the success "
-                f"rates; {AGAINST_COLLAPSE}."
+                f"rates; {against_collapse(finished.config.method)}."
             )
         )
     if finished.has_gone_on:

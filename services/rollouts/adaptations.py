@@ -96,6 +96,8 @@ class EpisodeOutcome(NamedTuple):
     steps: int
     sub_skill_steps: list[int]
     """Steps in which each sub-skill acted, up to the highest one that did."""
+    diverged: bool = False
+    """Whether it ended because an action was not finite."""
     fault: int | None = None
     """The first observation that the simulator gave and that is not finite, the reset's being 0."""
 
@@ -103,7 +105,8 @@ class EpisodeOutcome(NamedTuple):
     def of(cls, rollout: Rollout) -> "EpisodeOutcome":
         """Leave out the trajectory."""
         counts = np.bincount(rollout.sub_skills).tolist()
-        return cls(rollout.seed, rollout.goal, rollout.success, rollout.score, len(rollout), counts, rollout.fault)
+        ended = rollout.diverged, rollout.fault
+        return cls(rollout.seed, rollout.goal, rollout.success, rollout.score, len(rollout), counts, *ended)
 
 
 class AdaptationOutcome(NamedTuple):

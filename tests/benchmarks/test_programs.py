@@ -42,7 +42,9 @@ def test_device(tmp_path: Path) -> None:
 
 def test_adaptation(tmp_path: Path) -> None:
     rows = rows_of("adaptation", "--fine-tuning-steps", "2", "--rounds", "1", folder=tmp_path)
-    *ours_and_reference, mil = rows
+    *ours_and_reference, mil, imported, loaded, acting, adapting = rows
+    assert [row["target_seconds"] for row in (imported, loaded, acting, adapting)] == [1.5, 0.2, 150e-6, 0.5]
+    assert acting["seconds"] < adapting["seconds"]
     assert [row["what"] for row in ours_and_reference] == [
         "adapt, 1 shot, 2 steps",
         "act in 1 state",

@@ -15,6 +15,7 @@ from ray.cluster_utils import Cluster as Nodes
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import WorkError
+from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.dmil.method import Dmil
 from dmil_core.methods.registry import OURS
 from dmil_core.trajectories import Episode
@@ -348,7 +349,7 @@ def test_a_run_may_go_on_without_the_steps_that_are_not_finite(train, capsys: py
 
 
 def test_a_collapse_is_reported_once_when_it_has_lasted():
-    watch = CollapseWatch()
+    watch = CollapseWatch(DmilConfig())
 
     def update(number: int, share: float) -> str | None:
         return watch.update(number, {"sub_skill_share/0": share, "sub_skill_share/1": 1 - share, "agreement": 1.0})
@@ -361,7 +362,7 @@ def test_a_collapse_is_reported_once_when_it_has_lasted():
     assert "sub-skill 1 has taken over 99% of the states for 100 iterations, up to 199" in message
     assert "--training.learning-rate" in message
     assert update(200, 0.001) is None
-    assert all(CollapseWatch().update(number, {"sub_skill_share/0": 1.0}) is None for number in range(150))
+    assert all(CollapseWatch(DmilConfig()).update(number, {"sub_skill_share/0": 1.0}) is None for number in range(150))
 
 
 # Evaluations on the way

@@ -6,7 +6,16 @@ from scipy.stats import norm, t
 from dmil_core.methods.dmil.config import DmilConfig
 from services.evaluation.paper_results import Published
 from services.evaluation.results import AdaptationResult, EpisodeResult
-from services.evaluation.summary import sub_skill_shares, summary_rows
+from services.evaluation.summary import (
+    Summary,
+    against_collapse,
+    diverged_of,
+    headline,
+    rates,
+    sub_skill_shares,
+    summary_rows,
+    table_markdown,
+)
 
 ROW = {
     "suite": "ml10",
@@ -100,3 +109,27 @@ def test_a_suite_of_sub_tasks_has_scores():
     (alone,) = summary_rows(rows[:1], 4, DmilConfig(sub_skills=2))
     assert alone.score is not None
     assert (alone.score.mean, alone.score.deviation, alone.score.low) == (0, None, None)
+
+
+def test_adaptations_that_diverged_are_counted_and_named() -> None:
+    rows = [episode("meta-testing", "reach", 1, n, False).model_copy(update={"draw": n % 2}) for n in range(4)]
+    rows = [row.model_copy(update={"diverged": row.draw == 0}) for row in rows]
+    rows += [episode("meta-testing", "push", 3, 0, True)]
+    one, three = summary_rows(rows, 1, DmilConfig())
+    assert (one.diverged, one.episodes, three.diverged) == (1, 4, 0)
+    assert rates([one, three], {})["diverged/meta-testing/1-shot"] == 1
+    assert "diverged/meta-testing/3-shot" not in rates([one, three], {})
+    summary = Summary.model_construct(
+        method="dmil", protocol="p", seed=0, environment_steps=0, rows=[one, three], controls=[], faults=""
+    )
+    assert "diverged adaptations" in headline(summary)[0]
+    assert "1 adaptation diverged: an action was not finite" in table_markdown(summary)
+    assert diverged_of(summary.model_copy(update={"rows": [three]})) == ""
+
+
+def test_what_is_so_already_is_not_proposed_against_collapse() -> None:
+    assert against_collapse(DmilConfig(continuity_weight=0.1)).startswith(
+        "--method.balance sinkhorn, --method.labels-until above 0, --method.continuity-weight 0, another --seed"
+    )
+    so = DmilConfig(balance="sinkhorn", labels_until=5, continuity_weight=0)
+    assert against_collapse(so) == "another --seed or a smaller --training.learning-rate may help"
