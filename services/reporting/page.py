@@ -1,6 +1,7 @@
 """A page as one file: headings, prose, tables that sort, pictures, videos; nothing in it comes from elsewhere."""
 
 import base64
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +13,8 @@ from services.reporting.drawing import Picture
 
 MOST_BYTES = 2**28
 """Of a film."""
+NUMBER = re.compile(r"([+−-]?[\d.,]+%?(/[\d.,]+)?( (to|±) [+−-]?[\d.,]+)?( \(.*\))?)?")
+"""A number, a count of how many, an interval, or nothing."""
 TYPES = {".mp4": "video/mp4", ".gif": "image/gif"}
 
 
@@ -20,6 +23,14 @@ class Prose:
     """A paragraph."""
 
     text: str
+
+
+@dataclass(frozen=True)
+class Notice(Prose):
+    """A paragraph in a coloured box: what to know before all else."""
+
+    section: str = ""
+    """What the title of the section with more on it begins with; a link leads there where the page has one."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +48,14 @@ class DataTable:
     caption: str
     head: Sequence[str]
     rows: Sequence[Sequence[str | int | float]]
+    folded: bool = False
+    """Whether only the caption is seen at first."""
+
+    @property
+    def numeric(self) -> list[bool]:
+        """Of each column, whether it has numbers alone, which stand at its right."""
+        columns = zip(*self.rows, strict=True)
+        return [all(NUMBER.fullmatch(str(field)) for field in column) for column in columns] or [False] * len(self.head)
 
 
 @dataclass(frozen=True)
@@ -60,7 +79,7 @@ class Clip:
         return f"data:{self.type};base64,{base64.b64encode(content).decode()}"
 
 
-Part = Prose | Commands | DataTable | Picture | Clip
+Part = Prose | Notice | Commands | DataTable | Picture | Clip
 
 
 @dataclass(frozen=True)
@@ -91,5 +110,7 @@ def write_page(path: Path, title: str, lead: Sequence[Part], sections: Sequence[
     )
     templates.filters["kind"] = lambda part: type(part).__name__
     kept = [section for section in sections if section.parts]
-    page = templates.get_template("page.html").render(title=title, lead=lead, sections=kept)
+    page = templates.get_template("page.html").render(
+        title=title, lead=lead, sections=kept, ids={section.title: section.id for section in kept}
+    )
     write_file(path.parent, path.name, page)

@@ -17,6 +17,10 @@ def origin_of_run(finished: FinishedRun) -> Section:
     """Return the section with commands, demonstrations, the commit, versions and seconds."""
     manifest, commits = finished.checkpoint.manifest, ", then ".join(finished.origin.commits)
     parts: list[Part] = [
+        Commands(
+            "To add to this page what failed, films of it, sub-skills in rollouts, and success over fine-tuning steps",
+            [f"dmil report run {shlex.quote(str(finished.folder))} --videos --adaptation"],
+        ),
         Commands("To train and evaluate it again", [training_command(finished.checkpoint.manifest.config)]),
         Commands(
             "To evaluate the checkpoint again, and to write this page again",
@@ -95,4 +99,4 @@ def episodes_of_run(finished: FinishedRun) -> Section:
         path = finished.folder / "episodes.jsonl"
         parts.append(Prose(f"The first {MOST_ROWS:,} of {len(rows):,} episodes; all are in {path}."))
     caption = "Each episode; a draw is which of the support sets was adapted to, the seed is the environment's"
-    return Section("Episodes", [*parts, DataTable(caption, head + (["score"] if scored else []), fields)])
+    return Section("Episodes", [*parts, DataTable(caption, head + (["score"] if scored else []), fields, True)])

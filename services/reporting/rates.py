@@ -9,9 +9,11 @@ from services.evaluation.results import EpisodeResult
 from services.evaluation.summary import against_collapse, described, diverged_of, headline
 from services.experiments.finished_run import FinishedRun
 from services.reporting.drawing import INK, Picture, colour_of, panels, to_picture
-from services.reporting.page import DataTable, Part, Prose, Section
+from services.reporting.page import DataTable, Notice, Part, Prose, Section
 from services.suites.base import Split
 
+SUB_SKILLS = "Sub-skills on "
+"""What titles of sections that show them begin with."""
 ABREAST = 4
 """Panels side by side at most."""
 INCHES_A_TASK = 0.22
@@ -38,19 +40,24 @@ def table_of_all(finished: FinishedRun) -> list[Part]:
     head, *rows = headline(summary)
     parts: list[Part] = [Prose(f"Success rates of {described(summary)}.")]
     if summary.faults:
-        parts.append(Prose(f"Warning: {summary.faults}."))
+        parts.append(Notice(f"Warning: {summary.faults}."))
     if diverged := diverged_of(summary):
-        parts.append(Prose(f"Warning: {diverged}."))
+        parts.append(Notice(f"Warning: {diverged}."))
     if summary.collapsed:
         parts.append(
-            Prose(
+            Notice(
                 "Warning: one sub-skill takes nearly all states, so the hierarchy is not used, whatever the success "
-                f"rates; {against_collapse(finished.config.method)}."
+                f"rates; {against_collapse(finished.config.method)}.",
+                SUB_SKILLS,
             )
         )
+    elif use := summary.sub_skills.get("meta-testing"):
+        shares = ", ".join(f"{share:.2f}" for share in use.share)
+        text = f"Sub-skills take {shares} of the states of new tasks; {use.in_use_per_task:.1f} are in use in a task."
+        parts.append(Notice(text, SUB_SKILLS))
     if finished.has_gone_on:
         parts.append(
-            Prose(
+            Notice(
                 f"Warning: the run was trained on since: the figures are those of {summary.checkpoint}, its last "
                 f"checkpoint is {finished.checkpoint.path}. To evaluate that: dmil meta-train --resume "
                 f"{finished.folder}"

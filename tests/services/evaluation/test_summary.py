@@ -114,7 +114,7 @@ def test_a_suite_of_sub_tasks_has_scores():
 def test_adaptations_that_diverged_are_counted_and_named() -> None:
     rows = [episode("meta-testing", "reach", 1, n, False).model_copy(update={"draw": n % 2}) for n in range(4)]
     rows = [row.model_copy(update={"diverged": row.draw == 0}) for row in rows]
-    rows += [episode("meta-testing", "push", 3, 0, True)]
+    rows += [episode("meta-testing", "reach", 3, 0, True)]
     one, three = summary_rows(rows, 1, DmilConfig())
     assert (one.diverged, one.episodes, three.diverged) == (1, 4, 0)
     assert rates([one, three], {})["diverged/meta-testing/1-shot"] == 1

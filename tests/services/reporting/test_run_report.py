@@ -36,6 +36,8 @@ def test_a_runs_page_opens_from_disk_whole_and_accessible(finished: FinishedRun,
 
 def test_its_tables_sort(finished: FinishedRun, open_page):
     opened = open_page(finished.folder / "report" / "report.html")
+    assert not opened.page.locator("details table").is_visible(), "the episodes are folded"
+    opened.page.locator("summary").click()
     seeds = [int(seed) for seed in opened.sorted_by("Each episode", "seed")]
     assert seeds == sorted(row.seed for row in finished.episodes)
     steps = [int(count) for count in opened.sorted_by("Each episode", "steps")]
