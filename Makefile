@@ -3,6 +3,7 @@ PYTHON := $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALLED := .venv/installed
 PROCESSES := 3
+SELDOM := /(tests?|moto|rllib|_inductor|OpenGL|debugpy)/
 
 .DEFAULT_GOAL := help
 .PHONY: help setup train evaluate cluster cluster-stop docs test test-all missing tools mutants fuzz check-deploy audit clean
@@ -22,7 +23,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -m venv .venv
 	@echo "setup 2/2: the project and its pinned dependencies, some minutes the first time"
 	@$(BIN)/python -m pip install -qq --no-compile --disable-pip-version-check -c constraints.txt -e '.[test]'
-	@$(BIN)/python -m compileall -qq -j 0 .venv/lib || true # on all cores; a few files of packages are no Python 3
+	@$(BIN)/python -m compileall -qq -j 0 -x '$(SELDOM)' .venv/lib || true # on all cores; some files are no Python 3
 	@touch $@
 
 train: setup ## meta-train; its options go in ARGS: make train ARGS="--help"
@@ -50,6 +51,7 @@ $(BIN)/lint-imports
 endef
 
 test test-all: export OMP_NUM_THREADS = 1
+test test-all: export PYTHONDONTWRITEBYTECODE = # each program that a test starts would compile the project anew
 test: setup ## what proves the product, in some minutes: lint, format, types, imports and tests
 	$(CHECK)
 	$(BIN)/python -m pytest --ignore tests/deploy -m "not thorough" -n $(PROCESSES) --dist loadfile --no-loadscope-reorder --durations 10
@@ -58,7 +60,7 @@ test-all: tools setup ## everything, also what wants a browser, a database, prom
 	@$(INSTALL_CHECKERS)
 	$(CHECK)
 	$(BIN)/python -m pytest -m "not alone" -n $(PROCESSES) --dist loadfile --no-loadscope-reorder --durations 20
-	$(BIN)/python -m pytest -m alone --durations 20
+	$(BIN)/python -m pytest -m alone $$(grep -rl --include='test_*.py' mark.alone tests) --durations 20
 
 MISSING = $(strip \
 	$(if $(shell command -v chromium),,chromium) \

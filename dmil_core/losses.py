@@ -85,7 +85,7 @@ def differentiated(
 
     with torch.enable_grad():
         value = loss(at)
-    (gradient,) = torch.autograd.grad(value.sum(), at)
+        (gradient,) = torch.autograd.grad(value.sum(), at)
     return OutputLoss(value.detach(), gradient, curvature)
 
 

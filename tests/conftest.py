@@ -2,7 +2,10 @@
 
 import os
 import secrets
+from collections.abc import Callable
+from typing import Any
 
+import jaxtyping
 import pytest
 
 # Ray reads these when it is first imported, after this file, here and in every program that a test starts.
@@ -22,12 +25,40 @@ for _name in (
 ):  # fmt: skip
     os.environ.pop(_name, None)
 
+_decorated = jaxtyping.jaxtyped
+
+
+def _jaxtyped(*, typechecker: Any) -> Callable[[Any], Any]:
+    """Decorate as jaxtyping does, but for the functions that another defines at each call while nothing is checked.
+
+    To write the checks of such a one takes longer than what it does: half the time of a training.
+    """
+
+    def decorate(made: Any) -> Any:
+        inner = "<locals>" in getattr(made, "__qualname__", "")
+        return made if inner and jaxtyping.config.jaxtyping_disable else _decorated(made, typechecker=typechecker)
+
+    return decorate
+
+
+jaxtyping.jaxtyped = _jaxtyped  # which the modules of dmil_core find there
+
 LONGEST = (
     "test_same_bits.py", "test_tune_sweep.py", "test_tune_configs.py", "test_methods.py", "test_faults.py",
-    "test_runner.py", "test_programs.py", "test_meta_train.py", "test_remote.py", "test_jobs.py",
+    "test_runner.py", "test_programs.py", "test_meta_train.py", "test_jobs.py", "test_metaworld_speed.py",
+    "test_local_cluster.py", "test_fuzz.py", "test_remote.py", "test_metaworld.py", "test_stack.py", "test_progress.py",
 )  # fmt: skip
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the files that take longest first: one that begins last would keep one process busy and the other idle."""
-    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
+    """Put the files that take longest first: one that begins last would keep one process busy and the other idle.
+
+    Before all others go those that share a Ray cluster, which then ends.
+    """
+    on_ray = {item.path for item in items if "cluster" in getattr(item, "fixturenames", ())}
+
+    def place(item: pytest.Item) -> tuple[bool, int]:
+        name = item.path.name
+        return item.path not in on_ray, LONGEST.index(name) if name in LONGEST else len(LONGEST)
+
+    items.sort(key=place)

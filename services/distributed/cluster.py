@@ -7,9 +7,11 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import psutil
 
 from dmil_core.errors import RunError, UserError
 from services.distributed.node_info import usable_cpus
@@ -19,8 +21,10 @@ from services.storage.redaction import error_line, redacted
 if TYPE_CHECKING:
     from ray.job_config import JobConfig
 
+logger = logging.getLogger(__name__)
+
 OBJECT_STORE_BYTES = 500_000_000
-SECONDS_TO_ANSWER = 10.0
+SECONDS_TO_ANSWER = 20.0
 
 
 @contextmanager
@@ -50,6 +54,7 @@ def joined(workers: int | None = None) -> Iterator[None]:
             folder = stack.enter_context(private_folder())
             stack.callback(ray.shutdown)
             _start(
+                folder / "ray",
                 address="local",
                 num_cpus=max(usable_cpus(), workers or 0),
                 include_dashboard=False,
@@ -58,7 +63,6 @@ def joined(workers: int | None = None) -> Iterator[None]:
                 logging_level=logging.WARNING,
                 log_to_driver=False,
                 _node_ip_address="127.0.0.1",
-                _temp_dir=str(folder / "ray"),
                 _system_config={"enable_metrics_collection": False},  # they would be served to everybody
             )
         else:
@@ -69,21 +73,38 @@ def joined(workers: int | None = None) -> Iterator[None]:
         yield
 
 
-def _start(**options: Any) -> None:
-    """Start Ray on this machine.
+def _start(folder: Path, **options: Any) -> None:
+    """Start Ray on this machine, once more if it takes longer than the 30 s that Ray gives itself.
+
+    Args:
+        folder: that it makes for what is its own.
+        options: of `ray.init`.
 
     Raises:
         RunError: if it does not come up, as on a machine that is too busy.
     """
     import ray
 
-    try:
-        ray.init(**options)
-    except Exception as error:  # Ray raises plain ones
-        raise RunError(
-            f"Ray does not start on this machine: {error_line(error)}; start again, with less beside it, or without "
-            "Ray: --runner local"
-        ) from error
+    for last in (False, True):
+        try:
+            ray.init(**options, _temp_dir=str(folder))
+            return
+        except Exception as error:  # Ray raises plain ones
+            if last or "timed out during startup" not in str(error):
+                raise RunError(
+                    f"Ray does not start on this machine: {error_line(error)}; start again, with less beside it, or "
+                    "without Ray: --runner local"
+                ) from error
+            logger.warning("Ray is slow to start here; it is started once more")
+            _end_children_of(folder)
+
+
+def _end_children_of(folder: Path) -> None:
+    """End the processes below this one that were told to work in a folder."""
+    for process in psutil.Process().children(recursive=True):
+        with suppress(psutil.Error):
+            if any(str(folder) in part for part in process.cmdline()):
+                process.kill()
 
 
 def named_address() -> str | None:

@@ -41,6 +41,7 @@ def workplace(
     monkeypatch: pytest.MonkeyPatch,
 ) -> Path:
     """A working directory of the test's own, where programs find the toy suite, in this process and in others."""
+    services.without_pictures(monkeypatch)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(toy_package)
     project = Path(__file__).parents[2]

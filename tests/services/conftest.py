@@ -13,10 +13,12 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 import jaxtyping
+import psutil
 import pytest
 from mlflow import MlflowClient
 
@@ -164,43 +166,93 @@ def doors() -> Callable[..., Doors | None]:
     return doors
 
 
+def shared_memory_of(processes: list[psutil.Process]) -> set[Path]:
+    """Return the files in memory that processes have open."""
+    found = set[Path]()
+    for process in processes:
+        with suppress(psutil.Error):
+            found |= {Path(part.path) for part in process.memory_maps() if part.path.startswith("/dev/shm/")}
+    return found
+
+
 class Cluster(NamedTuple):
     """A Ray cluster on loopback, started from the project's root as a user would."""
 
     address: str
     dashboard: str
+    head: int
+    """The process that started it."""
 
 
-def start_head(folder: str, log: Path) -> tuple[subprocess.Popen[bytes], Cluster]:
-    """Start a Ray head, and wait until it answers or has ended."""
-    port, dashboard_port = free_port(), free_port()
-    command = [
-        sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block", "--num-cpus=3",
-        "--node-ip-address=127.0.0.1", f"--port={port}", "--dashboard-host=127.0.0.1",
-        f"--dashboard-port={dashboard_port}", "--include-dashboard=true", f"--temp-dir={folder}",
-        f"--dashboard-agent-listen-port={free_port()}",  # another cluster may hold the usual one
-        "--object-store-memory=200000000", "--disable-usage-stats",
-    ]  # fmt: skip
-    with log.open("w") as output:
-        head = subprocess.Popen(command, cwd=PROJECT, stdout=output, stderr=output)
-    cluster = Cluster(f"127.0.0.1:{port}", f"http://127.0.0.1:{dashboard_port}")
-    wait_for(lambda: answers(f"{cluster.dashboard}/api/version") or head.poll() is not None, "ray start")
-    return head, cluster
+class Head:
+    """One `ray start --head` with room for three workers, which is there from the first test that wants it."""
+
+    def __init__(self, log: Path) -> None:
+        self._log, self._folder = log, ""
+        self._process: subprocess.Popen[bytes] | None = None
+        self._cluster: Cluster | None = None
+
+    def cluster(self) -> Cluster:
+        """Start it, unless it runs."""
+        if self._cluster is None:
+            self._folder = tempfile.mkdtemp(prefix="dmil")  # Ray's sockets lie in it: over 107 bytes are too long
+            self._process, self._cluster = self._start()
+            for _ in range(2):  # somebody else was faster to take one of its ports, or is so busy that Ray gives up
+                if self._process.poll() is not None:
+                    self._process, self._cluster = self._start()
+            assert self._process.poll() is None, self._log.read_text()
+        return self._cluster
+
+    def _start(self) -> tuple[subprocess.Popen[bytes], Cluster]:
+        """Start Ray, and wait until it answers or has ended."""
+        port, dashboard_port = free_port(), free_port()
+        command = [
+            sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block", "--num-cpus=3",
+            "--node-ip-address=127.0.0.1", f"--port={port}", "--dashboard-host=127.0.0.1",
+            f"--dashboard-port={dashboard_port}", "--include-dashboard=true", f"--temp-dir={self._folder}",
+            f"--dashboard-agent-listen-port={free_port()}",  # another cluster may hold the usual one
+            "--object-store-memory=200000000", "--disable-usage-stats",
+        ]  # fmt: skip
+        unbuffered = os.environ | {"PYTHONUNBUFFERED": "1"}
+        with self._log.open("w") as output:
+            head = subprocess.Popen(command, cwd=PROJECT, stdout=output, stderr=output, env=unbuffered)
+        cluster = Cluster(f"127.0.0.1:{port}", f"http://127.0.0.1:{dashboard_port}", head.pid)
+
+        def is_up() -> bool:
+            """Tell also whether its node is: the dashboard is there before."""
+            return "Ray runtime started" in self._log.read_text() and answers(f"{cluster.dashboard}/api/version")
+
+        wait_for(lambda: is_up() or head.poll() is not None, "ray start")
+        return head, cluster
+
+    def stop(self) -> None:
+        """End it, if it runs: its eleven processes are never quite idle."""
+        if self._process is not None:
+            self._process.send_signal(signal.SIGTERM)
+            self._process.wait()
+            shutil.rmtree(self._folder, ignore_errors=True)
+        self._process = self._cluster = None
 
 
 @pytest.fixture(scope="session")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    """One `ray start --head` for the whole session, with room for three workers."""
-    folder = tempfile.mkdtemp(prefix="dmil")  # Ray's sockets lie in it: a path of over 107 bytes is too long
-    log = tmp_path_factory.mktemp("ray") / "head.log"
-    head, cluster = start_head(folder, log)
-    if head.poll() is not None:  # somebody else was faster to take one of its ports
-        head, cluster = start_head(folder, log)
-    assert head.poll() is None, log.read_text()
-    yield cluster
-    head.send_signal(signal.SIGTERM)
-    head.wait()
-    shutil.rmtree(folder, ignore_errors=True)
+def head(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Head]:
+    head = Head(tmp_path_factory.mktemp("ray") / "head.log")
+    yield head
+    head.stop()
+
+
+@pytest.fixture
+def cluster(head: Head) -> Cluster:
+    """The session's Ray cluster."""
+    return head.cluster()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _no_idle_cluster(request: pytest.FixtureRequest, head: Head) -> None:
+    """The files whose tests want a cluster come first: it ends at the first other one."""
+    items = (item for item in request.session.items if item.path == request.path)
+    if not any("cluster" in getattr(item, "fixturenames", ()) for item in items):
+        head.stop()
 
 
 @pytest.fixture
@@ -233,8 +285,10 @@ def shared_run(store: DemoStore, mlflow_file: str, tmp_path_factory: pytest.Temp
     runs = tmp_path_factory.mktemp("runs")
 
     @functools.cache
-    def run(name: str, *arguments: str) -> Path:
+    def run(name: str, *arguments: str, pictures: bool = False) -> Path:
         with pytest.MonkeyPatch.context() as environment:
+            if not pictures:
+                without_pictures(environment)
             environment.setenv("DMIL_DATA", str(store.root))
             environment.setenv("MLFLOW_TRACKING_URI", mlflow_file)
             environment.chdir(runs)
@@ -336,10 +390,14 @@ def _models_kept() -> None:
     metaworld_speed._compiled = functools.lru_cache(maxsize=8)(metaworld_speed._compiled.__wrapped__)
 
 
+def without_pictures(patch: pytest.MonkeyPatch) -> None:
+    """The page of a run that ends has its table, and not the pictures, which take longer than a small run."""
+    patch.setattr(run_report.write_run_page, "__defaults__", ((), lambda: None))  # no sections, and no bar
+
+
 @pytest.fixture
 def plain_pages(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The page of a run that ends has its table, and not the pictures, which take longer than a small run."""
-    monkeypatch.setattr(run_report, "write_run_page", functools.partial(run_report.write_run_page, sections=()))
+    without_pictures(monkeypatch)
 
 
 @pytest.fixture
@@ -376,5 +434,7 @@ def finished(shared_run: Callable[..., Path]) -> FinishedRun:
     """A run of four iterations on three tasks, evaluated on the way too: two episodes for each of 1 and 2 shots."""
     schedule = ("--training.iterations", "4", "--training.checkpoint-every", "2", "--evaluation.every", "2")
     return FinishedRun(
-        shared_run("tiny", *schedule, "--evaluation.shots", "1", "2", "--evaluation.fine-tuning-steps", "1")
+        shared_run(
+            "tiny", *schedule, "--evaluation.shots", "1", "2", "--evaluation.fine-tuning-steps", "1", pictures=True
+        )
     )

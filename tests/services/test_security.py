@@ -20,6 +20,7 @@ import pytest
 
 from services.storage.checkpoints import Checkpoints
 from services.tracking.tracker import Tracker
+from tests.services.conftest import QUICK_EVALUATION
 
 PROJECT = Path(__file__).parents[2]
 SECURED_BY = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "RAY_USAGE_STATS_ENABLED")
@@ -146,7 +147,8 @@ def test_a_whole_run_keeps_its_secrets(programs, train, workplace: Path, monkeyp
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{workplace / 'store.db'}")
     for name in ("MLFLOW_TRACKING_USERNAME", "MLFLOW_TRACKING_PASSWORD", "MLFLOW_TRACKING_TOKEN", "RAY_AUTH_TOKEN"):
         monkeypatch.setenv(name, planted)
-    code, printed = programs("meta_train", "--preset", "ml10-smoke", "--runner", "local", "--name", "run")
+    short = ("--training.iterations", "2", "--training.checkpoint-every", "2", *QUICK_EVALUATION)
+    code, printed = programs("meta_train", "--preset", "ml10-smoke", "--runner", "local", "--name", "run", *short)
     assert (code, printed.count(planted)) == (0, 0), printed
     assert (workplace / "store.db").exists()
     assert (workplace / "mlartifacts").is_dir()

@@ -16,6 +16,8 @@ from typing import Any
 
 import pytest
 
+from tests.services.conftest import QUICK_EVALUATION
+
 PROJECT = Path(__file__).parents[2]
 POSTGRES = max(Path("/usr/lib/postgresql").glob("*/bin"), default=Path("postgresql-is-not-installed"))
 NODES = ("127.0.0.2", "127.0.0.3")
@@ -38,6 +40,10 @@ class Network:
             [*self._inside, *command], text=True, capture_output=True, cwd=PROJECT, env=self._environment,
             **options,
         )  # fmt: skip
+
+    def listens(self, port: int) -> bool:
+        """Ask at little cost, before programs are started that ask more."""
+        return self.run("bash", "-c", f"exec 3<>/dev/tcp/127.0.0.1/{port}").returncode == 0
 
     def start(self, name: str, *command: str, **options: Any) -> None:
         with (self._folder / f"{name}.log").open("w") as log:
@@ -130,6 +136,7 @@ def test_a_job_on_two_raylets_becomes_a_finished_run_of_mlflow_on_postgres(
     client = "import mlflow, sys; c = mlflow.MlflowClient(); "
     listed = (*ray, "job", "list", "--address", "http://127.0.0.1:8265")
     try:
+        wait_for(lambda: network.listens(8265), "a dashboard")
         wait_for(lambda: network.run(*listed).returncode == 0, "Ray's head")
         status = (*ray, "status", "--address", "127.0.0.1:6379")
         for number, address in enumerate(NODES):  # they share a folder here, and one may not find itself in it
@@ -139,13 +146,15 @@ def test_a_job_on_two_raylets_becomes_a_finished_run_of_mlflow_on_postgres(
             )  # fmt: skip
             nodes = number + 2
             wait_for(lambda n=nodes: network.run(*status).stdout.count(" 1 node_") == n, "a worker")
+        wait_for(lambda: network.listens(5000), "a server")
         server_answers = (sys.executable, "-c", client + "c.search_experiments()")
         wait_for(lambda: network.run(*server_answers).returncode == 0, "MLflow")
         submitted = network.run(
             *ray, "job", "submit", "--address", "http://127.0.0.1:8265",
             "--runtime-env-json", f'{{"env_vars": {{"DMIL_DATA": "{store.root}"}}}}', "--",
             sys.executable, "-m", "services.meta_train", "--preset", "ml10-smoke",
-            "--runs", str(workplace / "runs"), "--name", "job",
+            "--runs", str(workplace / "runs"), "--name", "job", "--training.iterations", "2",
+            "--training.checkpoint-every", "2", *QUICK_EVALUATION,
         )  # fmt: skip
         assert submitted.returncode == 0, submitted.stdout + submitted.stderr
         runs = "c.search_runs([c.get_experiment_by_name('dmil-ml10').experiment_id])"

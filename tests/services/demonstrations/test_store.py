@@ -282,9 +282,9 @@ def test_whoever_collects_the_demonstrations_are_the_same(tmp_path: Path):
     )
     found = [
         digests(Experiment(settings, DemoStore(tmp_path / f"{kind}-{workers}")), kind, workers)
-        for kind, workers in (("local", None), ("ray", 1), ("ray", 2))
+        for kind, workers in (("local", None), ("ray", 2))
     ]
-    assert found[0] == found[1] == found[2]
+    assert found[0] == found[1]
     assert any(failed for _, failed in found[0].values()), "no attempt failed: the test does not show what it could"
 
 

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
+import psutil
 import pytest
 
 from dmil_core.errors import UserError
@@ -63,6 +64,26 @@ def test_a_cluster_of_another_token_is_told_soon(cluster: Cluster, environment: 
     given = {**os.environ, **environment, "RAY_ADDRESS": cluster.address}
     program = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=given)
     assert f"UserError: RAY_ADDRESS: got {cluster.address}, where another token is asked for" in program.stderr
+
+
+@pytest.mark.thorough
+def test_a_start_that_takes_ray_too_long_is_made_again(named, logged):
+    """As on a busy machine; nothing of the first is left beside the second."""
+    from ray._private import services
+
+    get_node, first = services.get_node, iter([Exception("The current node timed out during startup.")])
+
+    def late(*arguments: str) -> object:
+        for error in first:
+            raise error
+        return get_node(*arguments)
+
+    named.setattr(services, "get_node", late)
+    named.delenv("RAY_ADDRESS", raising=False)
+    with joined(1):
+        heads = [child for child in psutil.Process().children(recursive=True) if "gcs_server" in child.name()]
+        assert len([head for head in heads if head.status() != psutil.STATUS_ZOMBIE]) == 1
+    assert logged() == ["Ray is slow to start here; it is started once more"]
 
 
 @pytest.mark.parametrize(

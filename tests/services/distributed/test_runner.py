@@ -31,7 +31,7 @@ def cut(groups: int, size: int) -> list[slice]:
 @pytest.mark.usefixtures("joined")
 @pytest.mark.parametrize(
     ("slots", "group", "workers", "fan_in"),
-    [(7, 3, 3, 2), *(pytest.param(*case, marks=pytest.mark.thorough) for case in ((5, 1, 1, 8), (5, 1, 3, 4)))],
+    [(7, 3, 3, 2), pytest.param(5, 1, 1, 8, marks=pytest.mark.thorough)],
 )
 def test_any_number_of_workers_ends_with_the_same_bits(
     config, store: DemoStore, data, slots: int, group: int, workers: int, fan_in: int
@@ -80,7 +80,7 @@ def test_neither_the_fan_in_nor_the_blocks_change_a_bit(
     wanted = alone(experiment, data)
     all_groups = groups(experiment.config.training)
     with open_runner("ray", experiment.suite, 2):
-        for fan_in, size in ((2, 1), (2, 2), (8, 4)):
+        for fan_in, size in ((2, 1), (8, 4)):
             monkeypatch.setattr(
                 RayMetaTraining, "blocks", [all_groups[part] for part in cut(len(all_groups), size)], raising=True
             )
@@ -112,18 +112,12 @@ def test_the_groups_are_part_of_the_result(config, store: DemoStore, data):
 
 @pytest.mark.thorough
 @pytest.mark.usefixtures("joined")
-@pytest.mark.parametrize(
-    ("where", "slots"),
-    [
-        ("gradient", 5),
-        ("add", 5),
-        ("between two iterations", 5),
-    ],
-)
+@pytest.mark.parametrize("where", ["gradient", "add"])
 def test_a_killed_worker_changes_nothing(
-    config, store: DemoStore, data, where: str, slots: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config, store: DemoStore, data, where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    experiment = Experiment(training(config, slots, 1), store)
+    """Between two iterations `test_methods` kills one."""
+    experiment = Experiment(training(config, 5, 1), store)
     wanted = alone(experiment, data)
     note = tmp_path / "killed"
 
@@ -150,15 +144,10 @@ def test_a_killed_worker_changes_nothing(
                 return
             os.kill(os.getpid(), signal.SIGKILL)
 
-    def kill(done: int) -> None:
-        if where == "between two iterations" and done == 2:
-            assert isinstance(meta_training, RayMetaTraining)
-            meta_training._pool._workers[0].actor.__ray_call__.remote(lambda worker: worker._die_once())
-
     monkeypatch.setattr("services.distributed.ray_meta_training.AdaptationWorker", Mortal)
     with open_runner("ray", experiment.suite, 2) as runner:
         meta_training = runner.meta_train(plan_of(experiment, data))
-        disturbed = follow(meta_training, disturb=kill)
+        disturbed = follow(meta_training)
     assert note.exists()
     assert isinstance(meta_training, RayMetaTraining)
     assert meta_training.counter.count.restarted == 1

@@ -16,8 +16,8 @@ SCHEDULE = (
 )  # fmt: skip
 WAYS = {
     "local": ("--runner", "local"),
-    "beside": ("--runner", "ray", "--workers", "3"),
-    "in pauses": ("--runner", "ray", "--workers", "3", "--no-overlap-evaluation"),
+    "beside": ("--runner", "ray", "--workers", "2"),
+    "in pauses": ("--runner", "ray", "--workers", "1", "--no-overlap-evaluation"),
 }
 
 

@@ -15,7 +15,7 @@ from services.evaluation.comparison import Difference
 from services.experiments.champions import is_better
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.ownership import IDENTITY
-from tests.services.conftest import Server
+from tests.services.conftest import Server, without_pictures
 
 NAME = "ml10-part"
 TASKS = ("--suite.train-tasks", "drawer-close", "--suite.test-tasks", "door-close")
@@ -29,6 +29,7 @@ def runs(
     """A network that has learned nothing, and the nearest neighbour, which can close a door; MLflow was away then."""
     runs = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as environment:
+        without_pictures(environment)
         environment.chdir(runs)
         environment.setenv("DMIL_DATA", str(store.root))
         environment.setenv("MLFLOW_TRACKING_URI", f"http://127.0.0.1:{free_port()}")

@@ -52,18 +52,20 @@ def smoke(method: str, iterations: int) -> ExperimentConfig:
     [method if method == "option-gail" else pytest.param(method, marks=pytest.mark.thorough) for method in LEARNERS],
 )
 def test_here_and_on_workers_that_are_killed_the_same_bits_come_out(store: DemoStore, data, method: str):
+    """One of two workers is killed, of a method that needs more than gradients; the other methods have one."""
+    mortal = method == "option-gail"
     experiment = Experiment(smoke(method, 4), store)
     wanted = alone(experiment, data)
     assert np.isfinite(wanted.states[-1].parameters).all()
     assert any(map(np.not_equal, wanted.states[-1].parameters, wanted.states[0].parameters))
     steps = [slot.get("environment_steps", 0) for slots in wanted.slots for slot in slots]
     assert any(steps) == (method in ONLINE)
-    with open_runner("ray", experiment.suite, 2) as runner:
+    with open_runner("ray", experiment.suite, 2 if mortal else 1) as runner:
         meta_training = runner.meta_train(plan_of(experiment, data))
         assert isinstance(meta_training, RayMetaTraining)
 
         def strike(done: int) -> None:
-            if done == 2:
+            if mortal and done == 2:
                 os.kill(pid_of(meta_training._pool._workers[0].actor), signal.SIGKILL)
 
         assert_same_bits(follow(meta_training, disturb=strike), wanted)
@@ -220,7 +222,8 @@ EXAMPLE = PROJECT / "docs" / "examples" / "reptile"
 
 
 @pytest.mark.thorough
-def test_an_installed_method_is_meta_trained_to_its_table(programs, workplace: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.usefixtures("plain_pages")
+def test_an_installed_method_is_meta_trained_to_its_table(workplace: Path, complaint, capsys, monkeypatch):
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
     source = workplace / "source"
     source.mkdir()
@@ -228,16 +231,14 @@ def test_an_installed_method_is_meta_trained_to_its_table(programs, workplace: P
         (source / file).write_bytes((EXAMPLE / file).read_bytes())
     command += ["--no-build-isolation", "--no-index", "--target", str(workplace / "lib"), str(source)]
     subprocess.run(command, check=True)
-    paths = filter(None, (os.environ.get("PYTHONPATH"), str(workplace / "lib")))
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
+    monkeypatch.syspath_prepend(workplace / "lib")
     begin = ("--method", "reptile", "--preset", "smoke", "--runner", "local")
-    code, printed = programs("meta_train", *begin, "--name", "run", "--method.inner-steps", "3")
-    assert code == 0, printed
-    assert "Success rates of reptile" in printed
+    short = ("--training.iterations", "2", "--training.checkpoint-every", "2", *QUICK_EVALUATION)
+    meta_train.run([*begin, *short, "--name", "run", "--method.inner-steps", "3"])
+    assert "Success rates of reptile" in capsys.readouterr().out
     config = json.loads((workplace / "runs/run/config.json").read_text())
     assert (config["method"]["name"], config["method"]["inner_steps"]) == ("reptile", 3)
-    code, printed = programs("meta_train", *begin, "--method.inner-steps", "none")
-    assert code == 2, printed
+    assert "--method.inner-steps" in complaint(meta_train.run, *begin, "--method.inner-steps", "none")
 
 
 def test_a_package_s_method_with_a_name_of_ours_is_reported_in_words(programs, workplace: Path, monkeypatch):

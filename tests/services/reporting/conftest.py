@@ -1,6 +1,7 @@
 import shutil
 import sys
 from collections.abc import Callable
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +43,14 @@ def planar_visits(tmp_path: Path, planar_data: Path, mlflow_file: str, monkeypat
     return tmp_path
 
 
+@pytest.fixture(scope="session")
+def planar_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where a copy of each run on planar visits is kept, so that each is trained once."""
+    return tmp_path_factory.mktemp("planar-runs")
+
+
 @pytest.fixture
-def trained(planar_visits: Path) -> Callable[..., FinishedRun]:
+def trained(planar_visits: Path, planar_runs: Path) -> Callable[..., FinishedRun]:
     """Meta-trains a little on planar visits, and returns what is left: a checkpoint, without an evaluation."""
 
     def train(name: str, of: str = "dmil", **settings: Any) -> FinishedRun:
@@ -52,15 +59,19 @@ def trained(planar_visits: Path) -> Callable[..., FinishedRun]:
         if config.training.iterations:
             given["training"] = {"iterations": 4, "checkpoint_every": 4}
         config = checked(merged(config.model_dump(), given | settings, "test"))
+        folder = planar_visits / "runs" / name
+        copy = planar_runs / sha256(config.model_dump_json().encode()).hexdigest()
+        if copy.exists():
+            return FinishedRun(shutil.copytree(copy, folder))
         experiment = Experiment(config, DemoStore(data_root()))
         runner = LocalRunner(experiment.suite)
-        folder = planar_visits / "runs" / name
         folder.mkdir(parents=True)
         (folder / "config.json").write_text(config.model_dump_json())
         data = experiment.collect(runner)
         tracker = Tracker(folder, "test")
         experiment.train(runner, data, Checkpoints(folder / "checkpoints", 1), tracker)
         tracker.close("FINISHED")
+        shutil.copytree(folder, copy)
         return FinishedRun(folder)
 
     return train

@@ -206,7 +206,7 @@ def test_a_hidden_goal_is_zero_and_the_rest_is_equal(task):
         assert hidden_info["success"] == info["success"]
 
 
-@pytest.mark.parametrize("task", each_of(task for task in TASKS if task != "push-around-wall"))
+@pytest.mark.parametrize("task", each_of(task for task in TASKS if task != "push-around-wall"), scope="module")
 def test_hidden_goals_are_hidden_as_meta_world_hides_them(task):
     stock: Any = ALL_V3_ENVIRONMENTS_GOAL_HIDDEN[f"{task}-v3-goal-hidden"]()
     stock._freeze_rand_vec, stock.seeded_rand_vec = False, True
@@ -231,7 +231,7 @@ def test_the_expert_sees_the_hidden_goal_and_its_demonstration_does_not():
     assert not kept.observations[:, -3:].any()
 
 
-@pytest.mark.parametrize("task", each_of(ALL_TASKS))
+@pytest.mark.parametrize("task", each_of(ALL_TASKS), scope="module")
 def test_an_episode_follows_from_its_seed_alone(task: str):
     suite = MetaWorldSuite(SuiteConfig())
     used, fresh = suite.make_env(task), suite.make_env(task)
@@ -255,7 +255,7 @@ def test_an_episode_follows_from_its_seed_alone(task: str):
     assert not np.array_equal(first[0], other[0])
 
 
-@pytest.mark.parametrize("task", each_of(ALL_TASKS))
+@pytest.mark.parametrize("task", each_of(ALL_TASKS), scope="module")
 def test_the_goal_is_visible(task: str):
     env = MetaWorldSuite(SuiteConfig()).make_env(task)
     observation, _ = env.reset(seed=3)

@@ -1,7 +1,6 @@
 """A package's suite of tasks, from its installation to the table; and what is said of one that has a fault."""
 
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -87,15 +86,14 @@ def write_npz(path: Path, dims: tuple[int, int] = (9, 2), demonstrations: int = 
 
 
 @pytest.mark.thorough
-def test_an_installed_suite_is_meta_trained_to_its_table(package: Path, programs, workplace: Path, monkeypatch):
-    paths = filter(None, (os.environ.get("PYTHONPATH"), str(package)))
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
-    monkeypatch.setenv("DMIL_DATA", str(workplace / "data"))
-    code, printed = programs("meta_train", *SMOKE, "--name", "visits")
-    assert code == 0, printed
+@pytest.mark.usefixtures("plug_in", "plain_pages")
+def test_an_installed_suite_is_meta_trained_to_its_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    short = ("--training.iterations", "2", "--training.checkpoint-every", "2", "--evaluation.fine-tuning-steps", "1")
+    meta_train.run([*SMOKE, *short, "--name", "visits"])
+    printed = capsys.readouterr().out
     assert "all visits in turn within 80 steps, each from 0.1 m; seed 0" in printed
     assert len(re.findall(r"│ planar-visits +│ meta-t", printed)) == 4
-    summary = json.loads((workplace / "runs/visits/summary.json").read_text())
+    summary = json.loads((tmp_path / "runs/visits/summary.json").read_text())
     found = [
         (row["suite"], row["split"], row["shots"], row["episodes"], list(row["per_task"])) for row in summary["rows"]
     ]

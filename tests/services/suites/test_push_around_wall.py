@@ -69,8 +69,8 @@ def test_the_expert_solves_it(env, noise):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("noise", [0.0, 0.1])
-def test_the_expert_solves_95_of_100_seeds(env, noise):
-    assert solved(env, range(100), noise) >= 95
+def test_the_expert_solves_38_of_40_seeds(env, noise):
+    assert solved(env, range(40), noise) >= 38
 
 
 def test_the_expert_has_no_memory(env):

@@ -1,12 +1,16 @@
 """What the tests of sweeps share."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from mlflow import MlflowClient
 from mlflow.entities import Run
+from ray.util.placement_group import placement_group
+
+from services.distributed import cluster
+from tests.services.conftest import Cluster
 
 
 @pytest.fixture(scope="session")
@@ -21,3 +25,11 @@ def runs_of() -> Callable[[str, Path], tuple[Run, list[Run]]]:
         return parent, list(found)
 
     return find
+
+
+@pytest.fixture
+def one_at_a_time(joined: Cluster) -> Iterator[None]:
+    """Leaves one CPU of the session's cluster, so that trials run in their order."""
+    with cluster.joined():
+        assert placement_group([{"CPU": cluster.cpus() - 1}]).wait()
+        yield

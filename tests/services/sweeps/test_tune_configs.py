@@ -37,6 +37,9 @@ ROWS = {
         "tracking",
     ],
 }
+SHORT = {
+    "training": {"iterations": 2, "checkpoint_every": 2}, "evaluation": {"episodes": 1, "fine_tuning_steps": 1},
+}  # fmt: skip
 FLAT = {"MIL", "PEMIRL", "behaviour cloning", "per task", "nearest neighbour", "tracking"}
 """Rows of methods without sub-skills."""
 
@@ -73,7 +76,10 @@ def sweep(programs, workplace: Path, runs_of, mlflow_file: str, joined) -> Calla
 
 
 def test_a_sweep_ends_with_its_table(sweep, mlflow_file: str) -> None:
-    tables, parent, children = sweep("em")
+    settings = yaml.safe_load((CONFIGS / "em.yaml").read_text())
+    settings["presets"]["smoke"]["settings"] = SHORT
+    Path("em.yaml").write_text(yaml.safe_dump(settings | {"shots": [1]}))
+    tables, parent, children = sweep("em.yaml")
     artifacts = [found.path for found in MlflowClient(mlflow_file).list_artifacts(parent.info.run_id, "tables")]
     assert {"tables/report.html", "tables/table.png"} <= set(artifacts)
     assert list(dict.fromkeys(cell["row"] for cell in tables["cells"])) == ROWS["em"]
@@ -96,7 +102,7 @@ def test_one_training_has_a_row_for_each_evaluation_and_counts_its_practice(swee
     settings = {
         "what": "a test", "suites": ["ml10"], "seeds": [0], "variants": {"one": {"method": {"name": "option-gail"}}},
         "evaluations": {"1": {"fine_tuning_steps": 1}, "2": {"fine_tuning_steps": 2}}, "shots": [1],
-        "settings": {"training": {"iterations": 3, "checkpoint_every": 3}, "evaluation": {"episodes": 1}},
+        "settings": {"training": SHORT["training"], "evaluation": {"episodes": 1}},
     }  # fmt: skip
     Path("own.yaml").write_text(yaml.safe_dump(settings))
     tables, _, (child,) = sweep("own.yaml")
@@ -109,12 +115,13 @@ def test_one_training_has_a_row_for_each_evaluation_and_counts_its_practice(swee
 def test_a_search_stops_the_worse_and_names_the_best(sweep, workplace: Path) -> None:
     settings = yaml.safe_load((CONFIGS / "search.yaml").read_text())
     settings["search"]["space"]["method.hidden_units"] = [8]
+    settings["presets"]["smoke"]["samples"] = 3
     smoke = settings["presets"]["smoke"]["settings"]
     smoke["training"] = {"iterations": 4, "checkpoint_every": 2}
-    smoke["evaluation"] = {"every": 2, "episodes": 1, "fine_tuning_steps": 1}
+    smoke["evaluation"] = {"every": 2, **SHORT["evaluation"]}
     Path("own.yaml").write_text(yaml.safe_dump(settings))
     tables, _, children = sweep("own.yaml")
-    assert len(tables["samples"]) == len(children) == 4
+    assert len(tables["samples"]) == len(children) == 3
     assert tables["samples"][0]["status"] == "finished"
     assert {child.info.status for child in children} == {"FINISHED"}
     assert all(sample["held_out"] is not None for sample in tables["samples"])

@@ -139,7 +139,7 @@ def test_learns_to_tell_two_skills_apart_in_a_new_task(order: Literal["first", "
     )
     sets = training_sets()
     method = Dmil.prepared(config, 2, list(itertools.chain(*sets.values())))
-    parameters = meta_trained(method, sets, TrainingConfig(iterations=200, tasks_per_iteration=4, learning_rate=1e-2))
+    parameters = meta_trained(method, sets, TrainingConfig(iterations=120, tasks_per_iteration=4, learning_rate=1e-2))
     demonstrations, skills = record(101, 12)
     found, errors = [], []
     for steps in (0, 100):
