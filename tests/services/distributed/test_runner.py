@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from dmil_core.devices import Compute
-from dmil_core.outer_loop import groups
+from dmil_core.devices import Compute, GradientPath
+from dmil_core.outer_loop import add, groups
 from services.demonstrations.store import DemoStore
-from services.distributed.adaptation_worker import AdaptationWorker
+from services.distributed.adaptation_worker import AdaptationWorker, Block
 from services.distributed.chunking import CHUNK_LENGTH, from_chunks, to_chunks
 from services.distributed.learner import Learner
 from services.distributed.ray_meta_training import RayMetaTraining
@@ -46,29 +46,34 @@ def test_any_number_of_workers_ends_with_the_same_bits(
         assert_same_bits(follow(RayMetaTraining(plan, workers, fan_in)), wanted)
 
 
+def test_groups_at_once_give_the_same_bits_whoever_computes_which(config, store: DemoStore, data):
+    plan = plan_of(Experiment(training(config, 6, 2), store), data)
+    every, threads = groups(plan.settings), torch.get_num_threads()
+
+    def gradient(*some: range, path: GradientPath = "batched") -> list[np.ndarray]:
+        given = plan.method, plan.shapes, plan.demonstrations, plan.seed, None, Compute("cpu", path)
+        block = Block(0, plan.tasks(0), some)
+        return list(AdaptationWorker(*given).gradient(to_chunks(plan.state.parameters), block)[1])
+
+    whole, parts = gradient(*every), [gradient(one) for one in every]
+    total = [add(chunks) for chunks in zip(*parts, strict=True)]
+    torch.set_num_threads(threads)
+    assert all(map(np.array_equal, total, whole))
+    for one, other in zip(whole, gradient(*every, path="loop"), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU here")
 @pytest.mark.usefixtures("joined")
-@pytest.mark.parametrize(
-    "compute",
-    [
-        pytest.param(Compute("cpu", "batched"), marks=pytest.mark.thorough),
-        pytest.param(
-            Compute("cuda"),
-            marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU here")],
-        ),
-    ],
-    ids=["batched", "several workers on one card"],
-)
-def test_a_group_at_once_gives_the_same_bits_with_any_number_of_workers(
-    config, store: DemoStore, data, compute: Compute
-):
+def test_several_workers_on_one_card_end_with_the_same_bits(config, store: DemoStore, data):
     experiment, courses = Experiment(training(config, 6, 2), store), []
     runners: list[tuple[RunnerKind, int | None]] = [("local", None), ("ray", 3)]
     for kind, workers in runners:
-        with open_runner(kind, experiment.suite, workers, compute) as runner:
+        with open_runner(kind, experiment.suite, workers, Compute("cuda")) as runner:
             courses.append(follow(runner.meta_train(plan_of(experiment, data))))
     assert np.isfinite(courses[0].states[-1].parameters).all()
-    for course in courses[1:]:
-        assert_same_bits(course, courses[0])
+    assert_same_bits(*courses)
 
 
 @pytest.mark.thorough
