@@ -76,12 +76,13 @@ def test_its_settings_are_explained_those_that_differ_from_the_preset_first(fini
 
 def test_it_says_what_the_run_is_made_of_and_how_to_have_it_again(finished: FinishedRun):
     section = origin_of_run(finished)
-    again, evaluate, page = lines(section)
+    more, again, evaluate, page = lines(section)
+    assert more == f"dmil report run {finished.folder} --videos --adaptation"
     assert again == (
         "python -m services.meta_train --suite ml10 --preset smoke --training.iterations 4 "
         "--training.checkpoint-every 2 --evaluation.shots 1 2 --evaluation.fine-tuning-steps 1 --evaluation.every 2"
     )
-    assert f"--checkpoint {finished.checkpoint.path}" in evaluate
+    assert evaluate == f"dmil evaluate {finished.checkpoint.path}"
     assert page == f"dmil report run {finished.folder}"
     assert finished.origin.commits[0] in prose(section)
     assert finished.summary.checkpoint_digest in prose(section)
