@@ -199,7 +199,7 @@ def test_what_an_older_server_lacks_is_left_out(folder: Path, mlflow_server: Ser
 
         do_GET = do_POST  # noqa: N815
 
-        def log_message(self, *arguments: object) -> None:
+        def log_message(self, format: str, *args: object) -> None:
             pass
 
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Older) as older:
