@@ -198,7 +198,7 @@ def test_practice_ends_an_episode_at_its_success(experiment: Experiment, data):
     [
         (("--method", "foo"), "method.name: got 'foo'; wanted one of dmil, "),
         (("--method", "nearest-neighbour", "--training.iterations", "3"), "wanted 0: nearest-neighbour has no meta-tr"),
-        (("--method", "per-task", "--method.hidden-units", "0"), "hidden_units"),
+        (("--method", "per-task", "--method.hidden-units", "0"), "--method.hidden-units: got 0"),
     ],
 )
 @pytest.mark.usefixtures("workplace")

@@ -102,7 +102,7 @@ def test_one_training_has_a_row_for_each_evaluation_and_counts_its_practice(swee
     settings = {
         "what": "a test", "suites": ["ml10"], "seeds": [0], "variants": {"one": {"method": {"name": "option-gail"}}},
         "evaluations": {"1": {"fine_tuning_steps": 1}, "2": {"fine_tuning_steps": 2}}, "shots": [1],
-        "settings": {"training": SHORT["training"], "evaluation": {"episodes": 1}},
+        "settings": {"training": {"iterations": 3, "checkpoint_every": 3}, "evaluation": {"episodes": 1}},
     }  # fmt: skip
     Path("own.yaml").write_text(yaml.safe_dump(settings))
     tables, _, (child,) = sweep("own.yaml")
