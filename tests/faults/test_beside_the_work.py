@@ -133,8 +133,8 @@ def test_metrics_that_ray_does_not_take_end_nothing(monkeypatch, logged):
 def test_whatever_ends_a_run_leaves_its_last_iteration(workplace, monkeypatch, capsys, error, code):
     add = meta_training.IterationLog.add
 
-    def failing(log, iteration, *others: object) -> None:
-        add(log, iteration, *others)
+    def failing(log, iteration, metrics, device) -> None:
+        add(log, iteration, metrics, device)
         if iteration == 3:
             raise error
 
@@ -184,9 +184,9 @@ def test_each_signal_to_stop_leaves_a_checkpoint_also_when_it_comes_twice(workpl
         signal.raise_signal(number)
         return save(*arguments, **options)
 
-    def stopped(log, iteration, *others: object) -> None:
+    def stopped(log, iteration, metrics, device) -> None:
         monkeypatch.setattr(Checkpoints, "save", impatient)
-        add(log, iteration, *others)
+        add(log, iteration, metrics, device)
         signal.raise_signal(number)
 
     monkeypatch.setattr(meta_training.IterationLog, "add", stopped)
@@ -245,8 +245,8 @@ def test_a_stop_right_after_resuming_leaves_the_checkpoint_as_it_is(train, monke
 def test_a_removed_folder_ends_the_run_in_a_line(workplace, monkeypatch, capsys):
     add = meta_training.IterationLog.add
 
-    def removing(log, iteration, *others: object) -> None:
-        add(log, iteration, *others)
+    def removing(log, iteration, metrics, device) -> None:
+        add(log, iteration, metrics, device)
         if iteration == 3:
             (workplace / "runs" / "run").rename(workplace / "moved")
 
