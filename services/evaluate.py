@@ -138,6 +138,8 @@ def _config(
     config = with_evaluation(checkpoint.manifest.config, args.evaluation)
     changed: dict[str, dict[str, Any]] = {}
     if tasks is not None:
+        if len(set(tasks)) < len(tasks):
+            raise UserError(f"--tasks: got {', '.join(tasks)}; wanted each once: episodes would count twice")
         if args.promote:
             raise UserError(
                 "--promote: got --tasks or --demos with it; wanted all of the suite's, by which models are compared"

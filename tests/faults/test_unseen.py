@@ -88,7 +88,7 @@ def test_inspect_tells_an_episode_without_a_success():
     draw = np.random.default_rng(0)
     states, actions = draw.normal(size=(3, 5, 4)).astype("f4"), draw.uniform(-1, 1, (3, 5, 2)).astype("f4")
     episodes = [ExternalEpisode(states[i], actions[i], None, success) for i, success in enumerate((True, False, None))]
-    assert list(_problems(episodes, None)) == ["episode 1: no step is a success"]
+    assert [problem.words for problem in _problems(episodes, None)] == ["episode 1: no step is a success"]
 
 
 def test_a_resumed_run_goes_on_from_where_it_was(train, monkeypatch):

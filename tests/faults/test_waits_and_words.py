@@ -77,7 +77,7 @@ def test_a_file_of_another_kind_is_named(workplace: Path, complaint, monkeypatch
     monkeypatch.delenv("MINARI_DATASETS_PATH", raising=False)
     np.save(workplace / "array.npy", np.zeros(3))
     (workplace / name).write_bytes((workplace / "array.npy").read_bytes())
-    assert "wanted one of .npz, .hdf5, .h5" in complaint(inspect_demos.run, name)
+    assert "wanted minari:ID, hdf5:PATH, npz:PATH, npz:FOLDER" in complaint(inspect_demos.run, name)
     assert "minari download" in complaint(inspect_demos.run, "no/such-v0")
     assert not (workplace / "home").exists(), "nothing is made in the user's home"
 
@@ -88,7 +88,8 @@ def test_a_checkpoint_of_another_program_is_named(workplace: Path, complaint, co
     Path("folder").mkdir()
     (Path("folder") / "pytorch_model.bin").write_bytes(content)
     for place in ("model.pt", "folder"):
-        assert f"{place}/manifest.json: got " in complaint(evaluate.run, "--checkpoint", place, "--runner", "local")
+        printed = complaint(evaluate.run, "--checkpoint", place, "--runner", "local")
+        assert f"--checkpoint: got '{place}'; wanted the folder of a run or of a checkpoint" in printed
 
 
 def test_ray_that_does_not_come_up_is_one_line(monkeypatch, capsys):
