@@ -30,7 +30,8 @@ def stoppable() -> Iterator[list[int]]:
 
     def unraisable(told: "sys.UnraisableHookArgs") -> None:
         if told.exc_type is KeyboardInterrupt and received:
-            threading.Timer(AGAIN_SECONDS, signal.raise_signal, [received.pop()]).start()
+            again = [threading.main_thread().ident, received.pop()]  # the thread whose waiting a signal ends
+            threading.Timer(AGAIN_SECONDS, signal.pthread_kill, again).start()
         else:
             hook(told)
 

@@ -46,10 +46,10 @@ def promote(runs: Mapping[str, Path], tmp_path: Path, capsys: pytest.CaptureFixt
     """Evaluates a run, has its model promoted, and returns the lines that say what was decided."""
 
     def promote(which: str) -> list[str]:
-        output = ["--output", str(tmp_path / which)]
+        output = ["--output", str(tmp_path / f"evaluation-{len(list(tmp_path.iterdir()))}")]
         capsys.readouterr()
         evaluate.run(["--checkpoint", str(runs[which]), "--runner", "local", *output, "--promote"])
-        return capsys.readouterr().out.partition("report: ")[2].splitlines()[1:]
+        return capsys.readouterr().out.partition("its page: ")[2].splitlines()[1:]
 
     return promote
 
@@ -88,9 +88,9 @@ def test_what_cannot_be_promoted_is_reported_before_the_evaluation(
     for run in runs.values():
         tracking_program(["flush", str(run)])
     promote("better")
-    arguments = ["--runner", "local", "--promote", "--output", str(tmp_path / "none")]
+    arguments = ["--runner", "local", "--promote", "--runs", str(tmp_path / "none")]
     message = complaint(evaluate.run, "--checkpoint", str(runs["worse"]), *arguments, "--tasks", "reach")
-    assert "--promote: got --tasks with it" in message
+    assert "--promote: got --tasks or --demos with it" in message
 
     other = tmp_path / "other"
     shutil.copytree(runs["worse"], other)
@@ -107,7 +107,7 @@ def test_what_cannot_be_promoted_is_reported_before_the_evaluation(
     monkeypatch.setenv("MLFLOW_TRACKING_URI", uri.rpartition(":")[0] + ":1")
     with pytest.raises(RunError, match=r"MLflow at http://127\.0\.0\.1:1 does not answer"):
         evaluate.run([*checkpoint, *arguments])
-    assert not (tmp_path / "none" / "episodes.jsonl").exists()
+    assert not list(tmp_path.rglob("evaluations/*/episodes.jsonl"))
 
 
 def test_better_is_higher_somewhere_and_lower_nowhere():

@@ -58,7 +58,7 @@ def test_each_suite_that_is_named_has_a_picture(tmp_path: Path, capsys: pytest.C
 
 def test_the_program_says_what_it_draws(capsys: pytest.CaptureFixture[str]):
     report.run(["--help"])
-    assert "gallery   Draw the tasks of every suite" in capsys.readouterr().out
+    assert "gallery     Draw the tasks of every suite" in capsys.readouterr().out
 
 
 def test_a_report_that_there_is_not_is_reported_in_words(complaint):

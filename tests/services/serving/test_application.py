@@ -20,6 +20,7 @@ from services.serving.limits import Limits
 from services.serving.service import Service
 from services.serving.shelf import Shelf
 from tests.dmil_core.old_models import METHODS, old_model, recorded
+from tests.services.serving.loops import run_apart
 
 TOKEN = "a token"
 LIMITS = Limits(policies=3, body_megabytes=0.2, demonstrations=4, steps=50, observations=40)
@@ -250,7 +251,7 @@ def test_too_much_at_once_is_refused_for_now():
         ) as c:
             return await asyncio.gather(*(c.post("/v1/policies", json=wrong(steps=steps)) for steps in range(3)))
 
-    answers = asyncio.run(ask())
+    answers = run_apart(ask())
     assert sorted(answer.status_code for answer in answers) == [201, 429, 429]
     assert {answer.headers.get("retry-after") for answer in answers} == {None, "1"}
 

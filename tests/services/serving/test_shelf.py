@@ -7,6 +7,7 @@ import pytest
 
 from services.serving.limits import Limits
 from services.serving.shelf import EVICTED, EXPIRED, MOST_GONE, Gone, Kept, Shelf
+from tests.services.serving.loops import run_apart
 
 
 class Clock:
@@ -39,7 +40,7 @@ def test_a_policy_lives_for_its_time_from_when_it_was_posted_last(shelf: Shelf, 
         assert await shelf.get("a") == Gone(EXPIRED)
         assert await shelf.size() == (0, 0)
 
-    asyncio.run(check())
+    run_apart(check())
 
 
 def test_bytes_make_room_and_what_is_larger_than_all_is_not_kept(shelf: Shelf):
@@ -51,7 +52,7 @@ def test_bytes_make_room_and_what_is_larger_than_all_is_not_kept(shelf: Shelf):
         assert await shelf.put("d", {}, b"12345678901") is None
         assert await shelf.size() == (2, 8)
 
-    asyncio.run(check())
+    run_apart(check())
 
 
 def test_removals_are_heard_of_at_once_and_a_replica_of_another_shelf_forgets_all(shelf: Shelf):
@@ -67,7 +68,7 @@ def test_removals_are_heard_of_at_once_and_a_replica_of_another_shelf_forgets_al
         asked.cancel()
         assert await shelf.removals("replica", 57) == (1, None)
 
-    asyncio.run(check())
+    run_apart(check())
 
 
 def test_of_what_is_long_gone_nothing_is_known(shelf: Shelf):
@@ -78,4 +79,4 @@ def test_of_what_is_long_gone_nothing_is_known(shelf: Shelf):
         assert await shelf.get(str(2 * MOST_GONE)) == Gone(EVICTED)
         assert (await shelf.removals("replica", 0)).ids is None
 
-    asyncio.run(check())
+    run_apart(check())
