@@ -40,6 +40,8 @@ FOLDER = os.O_RDONLY | os.O_DIRECTORY
 Name = str | PurePath
 """A path below a folder, without ``..``."""
 
+_AT_WORK: list[Path] = []
+
 
 class DiskFullError(RunError):
     """A disk without room for what is to be written."""
@@ -72,6 +74,16 @@ def check_folder(folder: Path, mark: str = ".") -> None:
     """
     if not (folder / mark).exists():
         raise RunError(f"{folder}: got no such folder any more; wanted it where it was; put it back, then go on")
+
+
+@contextmanager
+def at_work_in(folder: Path) -> Iterator[None]:
+    """Make nothing below a folder inside once that is gone: `check_folder` then raises in the place of a new one."""
+    _AT_WORK.append(folder)
+    try:
+        yield
+    finally:
+        _AT_WORK.remove(folder)
 
 
 @contextmanager
@@ -116,6 +128,7 @@ def open_descriptor(root: Path, name: Name, flags: int) -> int:
 
     Raises:
         ForeignFileError: for a link on the way or at its end, and for anything but a regular file.
+        RunError: if the folder is gone that this process works in, see `at_work_in`.
         OSError: if it cannot be opened.
     """
     path = root / name
@@ -131,6 +144,9 @@ def open_descriptor(root: Path, name: Name, flags: int) -> int:
 def _parent(root: Path, name: Name, *, make: bool = False) -> Iterator[int]:
     """Give the descriptor of the folder that `name` lies in."""
     if make:
+        for folder in tuple(_AT_WORK):  # threads come and go
+            if root.is_relative_to(folder):
+                check_folder(folder)
         root.mkdir(parents=True, exist_ok=True)
     with ExitStack() as opened:
         path, here = root, os.open(root, FOLDER)

@@ -111,9 +111,11 @@ def run(arguments: Sequence[str]) -> None:
     experiment.read_sources()
     if args.resume is None:
         make_folder(folder, {MARK: args.experiment.model_dump_json(indent=1) + "\n"})
-        claim_name(folder)
-    with held(folder), replicated(folder):
-        _carry_out(args, folder, experiment)
+    with held(folder):
+        if args.resume is None:
+            claim_name(folder)
+        with replicated(folder):
+            _carry_out(args, folder, experiment)
 
 
 def _carry_out(args: Arguments, folder: Path, experiment: Experiment) -> None:

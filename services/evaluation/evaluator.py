@@ -11,7 +11,7 @@ import numpy as np
 from dmil_core.checkpoint import Checkpoint, CheckpointError, iteration_of
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import Demonstration
-from dmil_core.files import check_folder, inside
+from dmil_core.files import inside
 from dmil_core.settings import MethodConfig, sub_skills_of
 from services.cli.live_view import Tally
 from services.demonstrations.store import TaskDemonstrations
@@ -256,24 +256,9 @@ def write_evaluation(evaluation: Evaluation, folder: Path) -> None:
     """Write an evaluation's rows to ``adaptations.jsonl`` and ``episodes.jsonl``, in place of those there were.
 
     Each is written whole, the episodes last: where they are, the evaluation is complete.
-
-    Raises:
-        RunError: if `folder` is in that of the checkpoint's run, which is gone.
     """
-    check_run(evaluation.checkpoint, folder)
     write_rows(folder / "adaptations.jsonl", evaluation.adaptations)
     write_rows(folder / "episodes.jsonl", evaluation.episodes)
-
-
-def check_run(checkpoint: Checkpoint, folder: Path) -> None:
-    """See whether the run is there still that a checkpoint is of, if `folder` is in its folder.
-
-    Raises:
-        RunError: if not.
-    """
-    run = checkpoint.path.parent.parent
-    if folder.is_relative_to(run):
-        check_folder(run)
 
 
 def _finite(error: float | None) -> float | None:

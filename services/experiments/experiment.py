@@ -23,7 +23,7 @@ from services.distributed.failures import keeping_failures
 from services.distributed.runner import Plan, Runner
 from services.distributed.work_items import AdaptationRollouts
 from services.evaluation.controls import ControlRow, control_items, control_rows
-from services.evaluation.evaluator import Evaluations, Evaluator, Tallies, check_run, write_evaluation
+from services.evaluation.evaluator import Evaluations, Evaluator, Tallies, write_evaluation
 from services.evaluation.results import write_rows
 from services.evaluation.summary import Evaluation, faults_of
 from services.experiments.meta_training import CheckpointWriter, IterationLog, meta_train
@@ -275,7 +275,6 @@ class Experiment:
                     bar.advance(len(evaluator.adaptations[index].episodes))
                 done = [outcomes[index] for index in range(len(items))]
                 episodes = evaluator.evaluation(evaluation.checkpoint, done).episodes
-                check_run(evaluation.checkpoint, folder)
                 write_rows(folder / "controls" / control / "episodes.jsonl", episodes)
                 rows += control_rows(control, episodes, evaluation.episodes)
         return rows

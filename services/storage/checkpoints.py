@@ -27,7 +27,7 @@ from dmil_core.checkpoint import (
     read_manifest,
 )
 from dmil_core.checksums import listing, sha256
-from dmil_core.files import check_folder, create_file, making_folder, remove_abandoned, remove_folder, room_for
+from dmil_core.files import create_file, making_folder, remove_abandoned, remove_folder, room_for
 from dmil_core.networks import unflatten
 from dmil_core.outer_loop import OuterState
 
@@ -69,9 +69,8 @@ class Checkpoints:
 
         Raises:
             DiskFullError: for want of space; what was written by then is removed.
-            RunError: if the run's folder is gone.
+            RunError: if the run's folder is gone that this process works in.
         """
-        check_folder(self.folder.parent)
         path = self.folder / f"iteration-{state.iteration:07d}"
         parameters = unflatten(torch.tensor(state.parameters), manifest.torch_shapes)
         contents: dict[str, Mapping[str, np.ndarray]] = {

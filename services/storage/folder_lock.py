@@ -13,7 +13,7 @@ from pathlib import Path
 from pydantic import BaseModel, ValidationError
 
 from dmil_core.errors import UserError
-from dmil_core.files import open_descriptor, room_for
+from dmil_core.files import at_work_in, open_descriptor, room_for
 
 logger = logging.getLogger(__name__)
 
@@ -38,6 +38,8 @@ class Holder(BaseModel):
 @contextmanager
 def held(folder: Path, name: str = LOCK, *, wait: bool = False) -> Iterator[None]:
     """Hold a folder while this process works in it; the end of the process, however it comes, frees it.
+
+    If it is moved away meanwhile, it is not made anew.
 
     On a file system without locks a warning takes the lock's place.
 
@@ -70,7 +72,8 @@ def held(folder: Path, name: str = LOCK, *, wait: bool = False) -> Iterator[None
         with room_for(folder / name, len(content)):
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, content, 0)
-        yield
+        with at_work_in(folder):
+            yield
     finally:
         os.close(descriptor)
 

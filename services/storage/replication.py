@@ -53,7 +53,8 @@ class Replica:
         What the storage raises, whatever it is, passes through.
 
         Raises:
-            UserError: if it is another's.
+            RunError: if the folder is gone.
+            UserError: if the name is another's.
         """
         if self._claimed:
             return

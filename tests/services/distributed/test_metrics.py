@@ -5,6 +5,7 @@ import subprocess
 import sys
 import urllib.request
 from collections.abc import Container, Iterator
+from http.client import HTTPException
 from pathlib import Path
 
 import pytest
@@ -20,9 +21,12 @@ Series = dict[SeriesKey, float]
 
 
 def scraped(port: int) -> Series:
-    """Return the values of our metrics at a node, by name and our labels."""
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics") as answer:
-        lines = answer.read().decode().splitlines()
+    """Return the values of our metrics at a node, by name and our labels; none while it does not answer."""
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as answer:
+            lines = answer.read().decode().splitlines()
+    except (OSError, HTTPException):
+        return {}
     found = {}
     for name, labels, value in (line.groups() for line in map(LINE.fullmatch, lines) if line):
         own = {
