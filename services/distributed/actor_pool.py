@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import ray
-from ray.exceptions import ObjectLostError, RayActorError, RayError, RayTaskError
+from ray.exceptions import ObjectLostError, OutOfMemoryError, RayActorError, RayError, RayTaskError
 
 from dmil_core.errors import RunError, UserError
 from services.distributed.calls import Call, DeadlyCallError, LostError, PoolListener, Worker, referenced
@@ -17,6 +17,8 @@ PLACEMENT_TIMEOUT_SECONDS = 120
 MAX_DEATHS = 3
 """After so many deaths of workers during one call, the call is suspected to cause them."""
 POLL_SECONDS = 0.5
+DEATHS = (RayActorError, OutOfMemoryError)
+"""What Ray raises for a call whose actor died; the second where it has ended it itself, for the node's memory."""
 
 logger = logging.getLogger(__name__)
 
@@ -184,7 +186,7 @@ class Pool:
         worker = self._starting.pop(reference)
         try:
             ray.get(reference)
-        except RayActorError as error:
+        except DEATHS as error:
             self._failed_starts += 1
             if self._failed_starts == MAX_DEATHS:
                 raise RunError(f"workers: {MAX_DEATHS} ended while they started; {_last_line(error)}") from error
@@ -284,8 +286,8 @@ class Pool:
     def _fail(self, call: Call, error: RayError, *, from_backup: bool) -> None:
         """Process the failure of a call: its own, its actor's, or that of a dependency."""
         cause, worker = _root_cause(error), call.backup if from_backup else call.worker
-        if isinstance(cause, RayActorError):
-            if cause.actor_id in (None, _id(call.actor if worker is None else worker.actor)):
+        if isinstance(cause, DEATHS):
+            if getattr(cause, "actor_id", None) in (None, _id(call.actor if worker is None else worker.actor)):
                 self._handle_death(call, worker, cause)
                 return
             self._drop_backup(call)
@@ -307,16 +309,19 @@ class Pool:
         if call.worker is not None and call in call.worker.in_flight:
             call.worker.in_flight.remove(call)
 
-    def _handle_death(self, call: Call, worker: Worker | None, error: RayActorError) -> None:
+    def _handle_death(self, call: Call, worker: Worker | None, error: RayError) -> None:
         """Replace a worker that died during a call, and count the death against the call that it was running."""
+        why = " for want of memory" if isinstance(error, OutOfMemoryError) else ""
         if worker is None:
-            raise LostError(f"{call.label}: its actor died") from error
+            raise LostError(f"{call.label}: its actor died{why}") from error
         if worker is call.backup:
             suspect = call
             self._drop_backup(call)
         else:
             suspect = worker.in_flight[0]
-            logger.warning(f"worker {worker.number} ended in the course of {suspect.label}; its calls are sent again")
+            logger.warning(
+                f"worker {worker.number} ended{why} in the course of {suspect.label}; its calls are sent again"
+            )
             self._replace(worker)
         suspect.deaths += 1
         if suspect.deaths >= MAX_DEATHS and suspect in self._queued:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import ray
+from ray.exceptions import OutOfMemoryError
 
 from dmil_core.errors import RunError
 from services.distributed.actor_pool import MAX_DEATHS, Pool
@@ -44,6 +45,13 @@ def make(joined) -> Iterator:
                 time.sleep(0.3)  # until what was done before has been answered
                 os.kill(os.getpid(), signal.SIGKILL)
             return os.getpid(), number
+
+        def run_out_of_memory(self, folder: Path) -> int:
+            """End once as if by Ray's memory monitor."""
+            (folder / str(len(list(folder.iterdir())))).touch()
+            if len(list(folder.iterdir())) == 1:
+                raise OutOfMemoryError("the node has hardly any memory left")
+            return 1
 
         def sleep(self, seconds: float, folder: Path) -> tuple[int, int]:
             time.sleep(seconds)
@@ -122,6 +130,13 @@ def test_what_builds_upon_a_lost_call_is_made_again_too(
     assert [pool.result(call) == 11 or ray.get(call.references[-1]) == 11 for call in after] == [True] * 3
     assert counter.count.restarted == 2
     wait_for(lambda: bool(pool.poll() or len(pool) == 2), "the replacement")
+    pool.close()
+
+
+def test_a_call_whose_actor_ray_ends_for_want_of_memory_is_made_again(make, tmp_path: Path, caplog):
+    pool = Pool(make, 1)
+    assert pool.result(pool.submit("run_out_of_memory", tmp_path)) == 1
+    assert "worker 0 ended for want of memory in the course of" in caplog.text
     pool.close()
 
 
