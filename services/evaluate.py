@@ -22,22 +22,22 @@ from dmil_core.checkpoint import FOLDER, Checkpoint, opened
 from dmil_core.configs import EvaluationConfig, ExperimentConfig
 from dmil_core.devices import Compute
 from dmil_core.errors import RunError, UserError
-from dmil_core.files import at_home, inside, write_file
+from dmil_core.files import at_home, remove_folder, write_file
 from dmil_core.methods.registry import method_type
 from dmil_core.model import model_folder
 from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import checked, with_evaluation
 from services.cli.places import announce
-from services.cli.progress import Clock, aside, console
+from services.cli.progress import Clock, console
 from services.demonstrations.external import places_of
 from services.demonstrations.store import DATA, open_store
 from services.distributed.ray_runner import RunnerKind, check_compute, open_runner
 from services.evaluation.expectation import expected_rows, verdicts
-from services.evaluation.summary import Summary, summarise
-from services.experiments.champions import ALIAS, open_promotion
+from services.evaluation.summary import Summary
+from services.experiments.champions import ALIAS, Promotion, open_promotion
 from services.experiments.experiment import Experiment
-from services.experiments.finished_run import EVALUATED, FinishedRun
-from services.reporting.end_of_run import PAGE, REPORT, publish, show, write_report
+from services.experiments.finished_run import EVALUATED
+from services.reporting.end_of_run import conclude, show
 from services.storage.folder_lock import held
 from services.storage.run_folders import make_folder
 from services.tracking.links import database, tracking_uri
@@ -119,7 +119,8 @@ def run(arguments: Sequence[str]) -> None:
     )
     make_folder(output)
     with held(output):
-        summary = _carry_out(args, checkpoint, experiment, output, only)
+        promotion = _promotion(checkpoint, experiment, output) if args.promote else None
+        summary = _carry_out(args, checkpoint, experiment, output, only, promotion)
     found = verdicts(summary, expected)
     for verdict in found:
         console.print(verdict.words, soft_wrap=True)
@@ -168,10 +169,23 @@ def _new_folder(args: Arguments, checkpoint: Checkpoint) -> Path:
     return next(folder for folder in numbered if not folder.exists())
 
 
+def _promotion(checkpoint: Checkpoint, experiment: Experiment, output: Path) -> Promotion:
+    """Open a promotion; where that is refused, the new folder `output` is removed."""
+    try:
+        return open_promotion(checkpoint, experiment, output / ALIAS)
+    except (UserError, RunError):
+        remove_folder(output.parent, output.name)
+        raise
+
+
 def _carry_out(
-    args: Arguments, checkpoint: Checkpoint, experiment: Experiment, output: Path, only: tuple[str, ...] | None
+    args: Arguments,
+    checkpoint: Checkpoint,
+    experiment: Experiment,
+    output: Path,
+    only: tuple[str, ...] | None,
+    promotion: Promotion | None,
 ) -> Summary:
-    promotion = open_promotion(checkpoint, experiment, output / ALIAS) if args.promote else None
     write_file(output, EVALUATED, experiment.config.model_dump_json(indent=1) + "\n")
     clock, status = Clock(), "FAILED"
     tracker = Tracker(output, f"dmil-{experiment.config.suite.name}")
@@ -188,15 +202,7 @@ def _carry_out(
             if promotion is not None:
                 promotion.evaluate_champion(runner, data)
             clock.lap("evaluate")
-        summary = summarise(
-            evaluation, seconds=clock.seconds, folder=output, mlflow_run_id=tracker.run_id, controls=controls
-        )
-        write_report(summary, output)
-        from services.reporting.run_report import write_run_page  # takes seconds to import: not for --help
-
-        with aside("the evaluation's page"):
-            write_run_page(FinishedRun(output), inside(output, REPORT) / PAGE)
-        publish(tracker, summary, output)
+        summary = conclude(evaluation, controls, output, tracker, clock)
         lines = [] if promotion is None else promotion.decide(evaluation, output)
         status = "FINISHED"
     except KeyboardInterrupt:

@@ -21,18 +21,16 @@ from pydantic import ValidationError
 from dmil_core.configs import DEFAULT_METHOD, ExperimentConfig
 from dmil_core.devices import Compute, GradientPath
 from dmil_core.errors import UserError, describe_errors
-from dmil_core.files import check_folder, inside, read_file, write_file
+from dmil_core.files import check_folder, read_file, write_file
 from dmil_core.methods.registry import method_type
 from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import DEFAULT_PRESET, EARLY, defaults_from
 from services.cli.places import announce
-from services.cli.progress import Clock, aside, console
+from services.cli.progress import Clock, console
 from services.demonstrations.store import DATA, open_store
 from services.distributed.ray_runner import RunnerKind, check_compute, open_runner
-from services.evaluation.summary import summarise
 from services.experiments.experiment import Experiment, OnNonfinite, changed_settings, check_settings
-from services.experiments.finished_run import FinishedRun
-from services.reporting.end_of_run import PAGE, REPORT, publish, show, write_report
+from services.reporting.end_of_run import conclude, show
 from services.storage.checkpoints import Checkpoints
 from services.storage.folder_lock import held
 from services.storage.redaction import redacted
@@ -152,15 +150,7 @@ def _carry_out(args: Arguments, folder: Path, experiment: Experiment) -> None:
             controls = experiment.evaluate_controls(runner, data, evaluation, folder)
             clock.lap("evaluate")
         check_folder(folder, MARK)
-        summary = summarise(
-            evaluation, seconds=clock.seconds, folder=folder, mlflow_run_id=tracker.run_id, controls=controls
-        )
-        write_report(summary, folder)
-        from services.reporting.run_report import write_run_page  # takes seconds to import: not for --help
-
-        with aside("the run's page"):
-            write_run_page(FinishedRun(folder), inside(folder, REPORT) / PAGE)
-        publish(tracker, summary, folder)
+        summary = conclude(evaluation, controls, folder, tracker, clock)
         tracker.model(trained.path, experiment.held_out_sets(data)[experiment.tasks[-1][1]][:1])
         status = "FINISHED"
     except BaseException as error:

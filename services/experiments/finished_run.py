@@ -21,6 +21,8 @@ from services.tracking.history import Origin, read_metrics, read_origin
 Result = TypeVar("Result", EpisodeResult, AdaptationResult)
 MARK, BEGUN, CHECKPOINTS = "summary.json", "config.json", "checkpoints"
 """What the folder of a finished run is known by, what that of any run, and what no evaluation's has."""
+REPORT, PAGE = "report", "report.html"
+"""The folder of reports in a run's, and the page in it."""
 EVALUATED = "evaluation.json"
 """In the folder of an evaluation: the settings that were in force."""
 MOST_BYTES = 2**24

@@ -1,25 +1,41 @@
-"""What a run writes, records and shows at its end, besides its page."""
+"""What a run or an evaluation writes, records and shows at its end."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 from dmil_core.checkpoint import Checkpoint
-from dmil_core.files import write_file
-from services.cli.progress import console
-from services.evaluation.controls import said
+from dmil_core.files import inside, write_file
+from services.cli.progress import Clock, aside, console
+from services.evaluation.controls import ControlRow, said
 from services.evaluation.summary import (
+    Evaluation,
     Summary,
     control_table,
     diverged_of,
     rates,
+    summarise,
     table,
     table_markdown,
     write_summary,
 )
+from services.experiments.finished_run import PAGE, REPORT, FinishedRun
 from services.tracking.tracker import Tracker
 
-REPORT, PAGE = "report", "report.html"
-"""The folder of reports in a run's, and the page in it."""
+
+def conclude(
+    evaluation: Evaluation, controls: Sequence[ControlRow], folder: Path, tracker: Tracker, clock: Clock
+) -> Summary:
+    """Summarise what was evaluated, write that and its page to `folder`, and record it on the MLflow run."""
+    summary = summarise(
+        evaluation, seconds=clock.seconds, folder=folder, mlflow_run_id=tracker.run_id, controls=controls
+    )
+    write_report(summary, folder)
+    from services.reporting.run_report import write_run_page  # takes seconds to import: not for --help
+
+    with aside("the page"):
+        write_run_page(FinishedRun(folder), inside(folder, REPORT) / PAGE)
+    publish(tracker, summary, folder)
+    return summary
 
 
 def write_report(summary: Summary, folder: Path) -> None:

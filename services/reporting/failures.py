@@ -10,10 +10,9 @@ from jaxtyping import Float64
 
 from dmil_core.files import inside
 from services.evaluation.results import EpisodeResult
-from services.experiments.finished_run import FinishedRun
+from services.experiments.finished_run import REPORT, FinishedRun
 from services.experiments.replay import Replay, ReplayedEpisode, ReplayError, replaying
 from services.reporting.drawing import Picture, colour_of, panels, to_picture
-from services.reporting.end_of_run import REPORT
 from services.reporting.film import FORMS, video_settings, write_film
 from services.reporting.page import Clip, Commands, DataTable, Part, Prose, Section
 from services.reporting.video import camera_of, command, name_of, side_of

@@ -15,11 +15,10 @@ from services.cli.arguments import parse
 from services.cli.places import announce
 from services.cli.progress import Bar, console
 from services.distributed.ray_runner import RunnerKind, open_runner
-from services.experiments.finished_run import FinishedRun
+from services.experiments.finished_run import PAGE, REPORT, FinishedRun
 from services.reporting.adaptation_curves import adaptation_section, measure
 from services.reporting.curves import training_curves
 from services.reporting.embedding import embedding_section
-from services.reporting.end_of_run import PAGE, REPORT
 from services.reporting.failures import failures_of_run
 from services.reporting.page import Section, write_page
 from services.reporting.provenance import episodes_of_run, origin_of_run

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import functools
 import hashlib
+import logging
 import time
 import uuid
 import weakref
@@ -29,7 +30,10 @@ from services.serving.metrics import Metrics
 from services.serving.packing import unpacked
 from services.serving.policies import Arrays, FieldError, act, adapted
 from services.serving.shelf import Gone, Kept, Shelf
+from services.storage.redaction import error_line
 from services.suites.registry import open_suite
+
+logger = logging.getLogger(__name__)
 
 ID_DIGITS = 32
 """Of a policy's id."""
@@ -141,7 +145,8 @@ class Service:
         while True:
             try:
                 version, removed = await self._shelf.removals(self.name, version)
-            except Exception:  # noqa: BLE001  whatever Ray raises while the shelf starts anew
+            except Exception as error:  # noqa: BLE001  whatever Ray raises while the shelf starts anew
+                logger.warning(f"the shelf of policies does not answer ({error_line(error)}); asking it again")
                 removed = None
                 await asyncio.sleep(1.0)
             for name in list(self._held) if removed is None else removed:

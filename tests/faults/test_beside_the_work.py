@@ -108,7 +108,7 @@ def test_a_page_that_cannot_be_drawn_is_told_and_the_run_ends_well(train, logged
     assert ended_as(folder) == "FINISHED"
     assert (folder / "summary.json").exists()
     assert [line for line in logged() if "no font" in line] == [
-        "the run's page failed (ValueError: no font); going on without it"
+        "the page failed (ValueError: no font); going on without it"
     ]
 
 
