@@ -20,6 +20,7 @@ from services.reporting.adaptation_curves import adaptation_section, measure
 from services.reporting.curves import training_curves
 from services.reporting.embedding import embedding_section
 from services.reporting.failures import failures_of_run
+from services.reporting.film_strip import strip_of_run
 from services.reporting.page import Section, write_page
 from services.reporting.provenance import episodes_of_run, origin_of_run
 from services.reporting.rates import rates_of_tasks, table_of_all
@@ -32,6 +33,10 @@ Writing = Callable[[FinishedRun], Sequence[Section]]
 
 def _rates(finished: FinishedRun) -> list[Section]:
     return [rates_of_tasks(finished)]
+
+
+def _strip(finished: FinishedRun) -> list[Section]:
+    return [strip_of_run(finished)]
 
 
 def _sub_skills(finished: FinishedRun) -> list[Section]:
@@ -50,8 +55,8 @@ def _origin(finished: FinishedRun) -> list[Section]:
     return [settings_of_run(finished), origin_of_run(finished), episodes_of_run(finished)]
 
 
-AT_THE_END: Sequence[Writing] = (_rates, _curves, _origin)
-"""The sections for which it is enough to read the run's folder: a run writes them when it ends."""
+AT_THE_END: Sequence[Writing] = (_strip, _rates, _curves, _origin)
+"""The sections that a run writes when it ends: they take seconds."""
 
 
 def _all_sections(*, videos: bool) -> Sequence[Writing]:
@@ -60,7 +65,7 @@ def _all_sections(*, videos: bool) -> Sequence[Writing]:
     def failures(finished: FinishedRun) -> list[Section]:
         return [failures_of_run(finished, videos=videos)]
 
-    return _rates, failures, _sub_skills, _curves, _origin
+    return _strip, _rates, failures, _sub_skills, _curves, _origin
 
 
 @dataclass(frozen=True)

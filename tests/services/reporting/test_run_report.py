@@ -9,10 +9,12 @@ from services.evaluation.results import write_rows
 from services.experiments.finished_run import FinishedRun
 from services.reporting.page import Commands, DataTable, Prose, Section
 from services.reporting.provenance import episodes_of_run, origin_of_run
-from services.reporting.run_report import write_run_page
+from services.reporting.run_report import AT_THE_END, write_run_page
 from services.reporting.settings import settings_of_run
 
-TITLES = ["Success of each task", "Training curves", "Settings", "Where it comes from", "Episodes"]
+TITLES = [
+    "A new task, step by step", "Success of each task", "Training curves", "Settings", "Where it comes from", "Episodes"
+]  # fmt: skip
 MOST_BYTES = 5_000_000
 
 
@@ -29,7 +31,8 @@ def test_a_runs_page_opens_from_disk_whole_and_accessible(finished: FinishedRun,
     assert opened.page.locator("h2").all_inner_texts() == TITLES
     pictures = opened.pictures()
     assert [description.partition(": ")[0] for description, _, _ in pictures] == [
-        "meta-training", "meta-testing", "Success over the iterations", "Losses", "Use of sub-skills", "Outer step"
+        "An episode from its start to its end",
+        "meta-training", "meta-testing", "Success over the iterations", "Losses", "Use of sub-skills", "Outer step",
     ]  # fmt: skip
     assert all(len(description) > 80 and width > 300 and height > 60 for description, width, height in pictures)
 
@@ -121,7 +124,7 @@ def test_a_page_of_very_many_episodes_says_what_it_leaves_out(finished: Finished
     section = episodes_of_run(run)
     assert prose(section).startswith("The first 6,000 of 8,000 episodes")
     assert lines(section)[0].endswith("--task TASK --shots SHOTS --episode EPISODE")
-    write_run_page(run, tmp_path / "page.html")
+    write_run_page(run, tmp_path / "page.html", AT_THE_END[1:])  # they cannot be run again
     assert (tmp_path / "page.html").stat().st_size < MOST_BYTES
 
 
