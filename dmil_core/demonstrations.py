@@ -58,7 +58,7 @@ class Demonstration(Trajectory, _Named):  # bases in this order: a constructor t
                 step = int(np.argwhere(~np.isfinite(values).all(axis=1))[0, 0])
                 raise DemonstrationError(
                     f"demonstration {self.id} of {self.task}: {name} at step {step} is not finite; "
-                    "wanted real numbers only; drop the demonstration or mend the step"
+                    "wanted real numbers that float32 holds; drop the demonstration or mend the step"
                 )
         if len(self.observations) != len(self.actions):
             raise DemonstrationError(

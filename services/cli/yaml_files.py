@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from dmil_core.errors import UserError, shorten
+from dmil_core.errors import UserError, nearest, shorten
 from dmil_core.files import ForeignFileError, named, read_file
 
 MOST_BYTES = 2**16
@@ -27,10 +27,13 @@ def merged(settings: Mapping[str, Any], values: Mapping[Any, Any], origin: str, 
     for key, value in values.items():
         if key not in result:
             named = key if isinstance(key, str) and len(key) < 50 else shorten(key)
-            raise UserError(f"{origin}: got the unknown key {prefix}{named}; wanted one of {', '.join(result)}")
+            raise UserError(
+                f"{origin}: got the unknown key {prefix}{named}; wanted one of {', '.join(result)}{nearest(key, result)}"
+            )
         if isinstance(result[key], dict):
             if not isinstance(value, dict):
-                raise UserError(f"{origin}: {prefix}{key}: got {shorten(value)}; wanted keys: {', '.join(result[key])}")
+                got = "nothing" if value is None else shorten(value)
+                raise UserError(f"{origin}: {prefix}{key}: got {got}; wanted keys: {', '.join(result[key])}")
             value = merged(result[key], value, origin, f"{prefix}{key}.")
         result[key] = value
     return result
@@ -44,6 +47,7 @@ def read_yaml(file: Path, flag: str) -> dict[Any, Any]:
     """
     try:
         loader = _PlainLoader(read_file(*named(file), MOST_BYTES).decode())
+        loader.name = str(file)
         try:
             values = loader.get_single_data()
         finally:
@@ -54,7 +58,8 @@ def read_yaml(file: Path, flag: str) -> dict[Any, Any]:
     except (OSError, yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError) as error:
         raise UserError(f"{flag}: got {file}, {_cut(str(error))}; wanted a readable YAML file") from error
     if not isinstance(values, dict):
-        raise UserError(f"{flag}: got {file} with {type(values).__name__} in it; wanted keys with values")
+        got = "nothing" if values is None else f"no keys but {shorten(values)}"
+        raise UserError(f"{flag}: got {file} with {got} in it; wanted keys with values")
     return values
 
 

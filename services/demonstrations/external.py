@@ -85,7 +85,10 @@ def places_of(source: str) -> dict[str, str]:
                 "minari:ID,ID, each with TASK= before it where its last part is not the task's name"
             )
         if task in places:
-            raise DemonstrationError(f"demonstrations.source: got the task {task} twice; wanted one data set for each")
+            raise DemonstrationError(
+                f"demonstrations.source: got the task {task} twice; wanted one data set for each; a comma in a path is "
+                r"written \,"
+            )
         places[task] = f"{form}:{place}"
     return places
 

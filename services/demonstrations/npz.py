@@ -26,6 +26,7 @@ FORMS = {
     "tasks": ("U", (1,)),
 }
 """Of each array, the kinds of numbers and the numbers of axes."""
+IN_WORDS = {"f": "floating-point numbers", "fiu": "numbers", "iu": "whole numbers", "U": "text"}
 OPTIONAL = {"episode_lengths", "tasks"}
 MOST_ARCHIVE = 2**28
 """Bytes of a file."""
@@ -143,9 +144,11 @@ def episodes_in(
         return [_paired(*both) for both in zip(observations, actions, strict=True)]
     if lengths is None:
         return [_paired(observations, actions)]
-    _check_lengths(lengths, len(observations), len(actions))
-    cuts = np.cumsum(lengths.astype(np.int64))[:-1].tolist()
-    return list(zip(np.split(observations, cuts), np.split(actions, cuts), strict=True))
+    more = int(len(observations) == len(actions) + len(lengths))  # after the last action of each
+    _check_lengths(lengths, len(observations) - more * len(lengths), len(actions))
+    cuts = np.cumsum(lengths.astype(np.int64))[:-1]
+    observed = np.split(observations, cuts + more * np.arange(1, len(lengths)))
+    return [_paired(*both) for both in zip(observed, np.split(actions, cuts), strict=True)]
 
 
 def _paired(observations: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -247,8 +250,8 @@ def array_in(content: bytes, name: str, kinds: str, axes: tuple[int, ...]) -> np
         raise DemonstrationError(f"{name}: got the byte order of {dtype.str}; wanted this machine's")
     if dtype.kind not in kinds or len(shape) not in axes:
         raise DemonstrationError(
-            f"{name}: got {dtype} of the shape {shape}; wanted {' or '.join(map(str, axes))} axes and a type of the "
-            f"kind {' or '.join(kinds)}"
+            f"{name}: got {dtype} of the shape {shape}; wanted {IN_WORDS[kinds]} along {' or '.join(map(str, axes))} "
+            f"ax{'i' if axes == (1,) else 'e'}s"
         )
     wanted = math.prod(shape) * dtype.itemsize
     if (there := len(content) - stream.tell()) != wanted or min(shape) < 0:

@@ -121,12 +121,13 @@ class Delivery:
         self._holding = ExitStack()
         self._is_ours = False
         self._client: MlflowClient | None = None
-        self._checked = False
         self._usual = self._limit = SLOW_SECONDS if uri.startswith("http") else OPENING_SECONDS
         self._asked: float | None = None
         self._was_slow = False
         self.identity = Identity.of(folder)
         """Which MLflow run it is, and how many records that has taken, as far as is known."""
+        self.found = False
+        """Whether MLflow was seen to have the run, and it is ours."""
         self._offset = self._delivered_bytes()
 
     @property
@@ -234,10 +235,10 @@ class Delivery:
         if run_id is None:
             experiment_id = self._experiment_in(self._client)
             run_id = self._run_in(self._client, experiment_id)
-        if not self._checked:
+        if not self.found:
             with self._asking():
                 check_run(self._client, self._uri, self._folder, run_id, self.identity.tag)
-            self._checked = True
+            self.found = True
         if self.identity.run_id is None:
             self._note(run_id=run_id, experiment_id=experiment_id)
         return self._client, run_id

@@ -71,10 +71,12 @@ class Tracker:
     def address_lines(self) -> list[str]:
         """Lines that say where the MLflow run is, as far as it is known, and how to look at it."""
         run_id, experiment_id, uri = self.run_id, self._delivery.identity.experiment_id, tracking_uri()
-        lines = [f"MLflow run: {run_id or 'not there yet'} at {self.uri}"]
+        if run_id is None or not self._delivery.found:
+            return [f"MLflow run: {run_id or 'none'}, not found at {self.uri}"]
+        lines = [f"MLflow run: {run_id} at {self.uri}"]
         if (command := ui_command(uri)) is not None:
             lines.append(f"to look at it: {command}")
-        if run_id is not None and experiment_id is not None:
+        if experiment_id is not None:
             lines.append(f"its page: {run_link(uri, experiment_id, run_id)}")
         return lines
 

@@ -52,6 +52,12 @@ def test_space_is_looked_for_before_anything_is_written(tmp_path: Path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_disk_that_does_not_tell_its_size_is_not_full():
+    """Such as a network disk's; here it is that of the kernel's own folder."""
+    with room_for(Path("/proc/self/file"), 2**70):
+        pass
+
+
 def test_other_errors_stay_what_they_are(tmp_path: Path):
     with pytest.raises(PermissionError), room_for(tmp_path / "file", 1):
         raise PermissionError(errno.EACCES, "no")

@@ -110,15 +110,19 @@ MISTAKES = {
 }
 LAUGHS = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}, *{a}, *{a}]\n" for a, b in pairwise("abcdefghijklmnop"))
 FILES = {
-    "unknown key": ("method: {sub_skill: 5}", ("method.sub_skill", "sub_skills", "continuity_weight")),
+    "unknown key": (
+        "method: {sub_skill: 5}",
+        ("method.sub_skill;", "; the nearest are sub_skills", "continuity_weight"),
+    ),
     "unknown section": ("methods: {}", ("methods", "method", "training")),
     "wrong type": ("training: {iterations: soon}", ("training.iterations", "'soon'", "integer")),
     "half a number": ("training: {iterations: 2.5}", ("training.iterations", "2.5", "integer")),
     "value for a section": ("method: 5", ("method", "got 5", "sub_skills")),
     "not a number": ("method: {continuity_weight: .nan}", ("method.continuity_weight", "nan")),
-    "list": ("- seed", ("list", "wanted keys")),
-    "empty": ("", ("NoneType", "wanted keys")),
-    "alias": ("seed: &s 1\ntraining: {iterations: *s}", ("settings.yaml", "found an alias", "line 2")),
+    "list": ("- seed", ("with no keys but ['seed'] in it", "wanted keys")),
+    "empty": ("# seed: 1", ("settings.yaml with nothing in it", "wanted keys")),
+    "empty section": ("training:", ("settings.yaml: training: got nothing; wanted keys",)),
+    "alias": ("seed: &s 1\ntraining: {iterations: *s}", ("found an alias", 'settings.yaml", line 2')),
     "billion laughs": (LAUGHS, ("settings.yaml", "found an alias")),
     "deep": ("method: " + "[" * 500, ("settings.yaml", "deep nesting")),
     "large": ("seed: " + "1" * 70_000, ("settings.yaml", "70006 bytes, of which at most 65536 are read")),

@@ -69,6 +69,14 @@ def test_recorded_demonstrations_are_read(number: int, episodes: int):
     assert len(found) == episodes
 
 
+def test_an_observation_after_the_last_action_of_each_is_left_out(write, arrays: Arrays):
+    alike = read_npz(write(arrays), "kettle")
+    arrays["observations"] = np.insert(arrays["observations"], [4, 5, 9], 7, axis=0)
+    assert [d.observations.tobytes() for d in read_npz(write(arrays), "kettle")] == [
+        d.observations.tobytes() for d in alike
+    ]
+
+
 def changed(name: str, array: object) -> Callable[[Arrays], None]:
     return lambda arrays: arrays.update({name: np.asarray(array)})
 
@@ -81,7 +89,10 @@ MISTAKES: dict[str, tuple[Callable[[Arrays], object], str]] = {
     "NaN in a state": (with_value("observations", np.nan), "demonstration 001 of kettle: observations at step 0"),
     "infinite action": (with_value("actions", -np.inf), "demonstration 001 of kettle: actions at step 0"),
     "beyond float32": (changed("observations", np.full((9, 6), 1e300)), "observations at step 0 is not finite"),
-    "one axis": (changed("actions", np.zeros(9)), "actions: got float64 of the shape (9,)"),
+    "one axis": (
+        changed("actions", np.zeros(9)),
+        "actions: got float64 of the shape (9,); wanted floating-point numbers along",
+    ),
     "three axes": (
         changed("observations", np.zeros((9, 2, 3))),
         "got observations of the shape (9, 2, 3) and actions of",
@@ -94,6 +105,10 @@ MISTAKES: dict[str, tuple[Callable[[Arrays], object], str]] = {
     "an empty demonstration": (changed("episode_lengths", [4, 0, 5]), "episode_lengths: got [4, 0, 5]"),
     "a negative length": (changed("episode_lengths", [10, -1]), "episode_lengths: got [10, -1]"),
     "lengths that overflow": (changed("episode_lengths", [2**62] * 4 + [9]), "episode_lengths: got [46"),
+    "names that are no text": (
+        changed("tasks", [1, 2]),
+        "tasks: got int64 of the shape (2,); wanted text along 1 axis",
+    ),
     "no demonstration": (changed("episode_lengths", np.zeros(0, int)), "episode_lengths: got []"),
     "lengths that are no counts": (changed("episode_lengths", [4.0, 5.0]), "episode_lengths: got float64"),
     "nothing in it": (lambda arrays: arrays.clear(), "got the members []"),
