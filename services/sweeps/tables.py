@@ -11,6 +11,7 @@ from services.evaluation.comparison import Cell, CellKey, Comparison, Difference
 from services.evaluation.paper_results import figure
 from services.evaluation.results import Metric
 from services.sweeps.folders import SweepFolder
+from services.sweeps.settings import PlannedTrial
 
 
 class Sample(BaseModel):
@@ -59,7 +60,7 @@ def comparison_of(sweep: SweepFolder, baseline: str | None = None) -> Comparison
     named = baseline or settings.baseline or settings.row_names[0]
     comparison = Comparison(
         rows=settings.row_names,
-        suites=settings.suites,
+        suites=suites_of(sweep),
         splits=settings.splits,
         shots=settings.shots,
         metric=settings.metric,
@@ -76,6 +77,17 @@ def comparison_of(sweep: SweepFolder, baseline: str | None = None) -> Comparison
     )
 
 
+def suite_of(trial: PlannedTrial) -> str:
+    """Return what a trial's suite is called: a part, which no figure of the paper's is of, where tasks are left out."""
+    tasks = trial.config.suite
+    return trial.suite if tasks.train_tasks is tasks.test_tasks is None else f"{trial.suite}-part"
+
+
+def suites_of(sweep: SweepFolder) -> list[str]:
+    """Return what the suites of a sweep are called, in its order."""
+    return list(dict.fromkeys(suite_of(trial) for trial in sweep.trials.values()))
+
+
 def _evaluations(sweep: SweepFolder) -> Iterator[SeedEvaluation]:
     for name, trial in sweep.trials.items():
         result = sweep.result(name)
@@ -84,7 +96,7 @@ def _evaluations(sweep: SweepFolder) -> Iterator[SeedEvaluation]:
         for row, folder in result.evaluated.items():
             yield SeedEvaluation(
                 row=row,
-                suite=trial.suite,
+                suite=suite_of(trial),
                 seed=trial.seed,
                 name=name,
                 config=with_evaluation(trial.config, trial.evaluations[row]),
@@ -103,14 +115,14 @@ def tables_of(sweep: SweepFolder, comparison: Comparison | None = None) -> Table
     return Tables(
         name=record.name,
         what=settings.what,
-        paper=settings.paper,
+        paper=settings.paper if any(cell.paper for cell in comparison.cells) else None,
         metric=settings.metric,
         preset=record.preset,
         began=f"{record.began:%Y-%m-%d %H:%M} UTC",
         commit=record.commit,
         command=record.command,
         by=settings.rows,
-        rows=list(settings.suites if settings.rows == "suites" else settings.row_names),
+        rows=suites_of(sweep) if settings.rows == "suites" else settings.row_names,
         columns=list(dict.fromkeys(column_of(key, settings.rows) for key in comparison.keys)),
         cells=comparison.cells,
         differences=[pair for pair in comparison.pairs if isinstance(pair, Difference)],
@@ -138,7 +150,7 @@ def _samples(sweep: SweepFolder) -> list[Sample]:
         samples.append(
             Sample(
                 sample=trial.variant,
-                suite=trial.suite,
+                suite=suite_of(trial),
                 seed=trial.seed,
                 status=result.status if result else "not run",
                 iteration=result.iteration if result else 0,

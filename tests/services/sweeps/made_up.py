@@ -30,9 +30,9 @@ def make(runs: Path, solved: Solved, finished: Sequence[str] = (), **changes: ob
 
 
 def make_of(runs: Path, settings: Sweep, solved: Solved, finished: Sequence[str] = ()) -> SweepFolder:
-    """Write the folder of a sweep at preset smoke, with trials as if they had run."""
+    """Write the folder of a sweep at preset quick, with trials as if they had run."""
     record = SweepRecord(
-        name="made-up", preset="smoke", sweep=settings, began=datetime(2026, 1, 2, tzinfo=UTC),
+        name="made-up", preset="quick", sweep=settings, began=datetime(2026, 1, 2, tzinfo=UTC),
         command="python -m services.tune_sweep made-up", commit="abc", versions={},
     )  # fmt: skip
     sweep = SweepFolder.make(runs / "made-up", record)

@@ -189,7 +189,7 @@ def test_a_sweep_has_the_same_page(tmp_path: Path, open_page) -> None:
     opened = open_page(sweep.path / "tables" / "report.html")
     assert (opened.requests, opened.complaints, opened.faults()) == ([], [], [])
     text = opened.page.inner_text("main")
-    assert "Success rate at preset smoke; trials: 6 finished. Beside it stands Table 4 of the paper." in text
+    assert "Success rate at preset quick; trials: 6 finished. Beside it stands Table 4 of the paper." in text
     assert "seeds are drawn with replacement, all runs of a seed together" in text
     assert opened.sorted_by("Success rates", "mean success rate") == ["0.700"] * 2 + ["0.800"] * 6
     assert "None but the seed." in text
