@@ -202,7 +202,7 @@ def attempt(number: int, root: Path, template: Path) -> str:
         return f"ends with {code}: {plain.printed().splitlines()[-1][-200:]}"
     check_delivered(plain, plain.losses())
     code, reached = strike(combination, struck, seconds)
-    if code:
+    if code or not struck.is_begun:  # the machine may be lost just after the run's end
         resumes = struck.is_begun or (struck.storage / "runs" / struck.run.name / "config.json").exists()
         if isinstance(combination.stroke, MachineLost) and not resumes and combination.has_claimed(struck):
             return "lost with its name"
