@@ -45,15 +45,15 @@ def own_token(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def started(
-    programs, own_token: None, ports: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch
+    programs, own_token: None, ports: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch, wait_for
 ) -> Iterator[tuple[Path, str]]:
     """A cluster of its own, and what it said when it was started."""
     with monkeypatch.context() as behind_a_proxy:
         behind_a_proxy.setenv("http_proxy", PROXY)
         code, printed = programs("local_cluster", "start", *ports)
     assert code == 0, printed
+    wait_for(lambda: bool(shared_memory_of(processes_of(workplace / "cluster"))), "the object store")
     shared = shared_memory_of(processes_of(workplace / "cluster"))
-    assert shared
     yield workplace / "cluster", printed
     if (workplace / "cluster" / "cluster.json").exists():
         programs("local_cluster", "stop")
