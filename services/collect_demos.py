@@ -18,7 +18,8 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from dmil_core.configs import ExperimentConfig
+from dmil_core.configs import DemonstrationConfig, SuiteConfig
+from dmil_core.settings import Settings
 from services import inspect_demos, record_demos, verify_experts
 from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import DEFAULT_PRESET, EARLY, defaults_from
@@ -29,13 +30,20 @@ from services.distributed.ray_runner import RunnerKind, open_runner
 from services.experiments.experiment import Experiment
 
 
+class Collection(Settings):
+    """Which demonstrations are made: the settings of an experiment that matter here."""
+
+    suite: SuiteConfig
+    demonstrations: DemonstrationConfig
+
+
 @dataclass(frozen=True)
 class Arguments:
     """Arguments of ``collect_demos``."""
 
-    experiment: Annotated[ExperimentConfig, tyro.conf.arg(name="")]
+    collection: Annotated[Collection, tyro.conf.arg(name="")]
     preset: str = DEFAULT_PRESET
-    """Settings to begin with; those of suite and demonstrations count here."""
+    """Settings to begin with."""
     suite: str | None = None
     """The suite, as ml10, ml45, ML1-reach, push-around-wall or kitchen; short for --suite.name."""
     demos: str | None = None
@@ -57,10 +65,12 @@ def run(arguments: Sequence[str]) -> None:
     if arguments and arguments[0] in OTHERS:
         OTHERS[arguments[0]](arguments[1:])
         return
-    args = parse(Arguments, __doc__ or "", arguments, Arguments(defaults_from(peek(arguments, **EARLY))))
+    config = defaults_from(peek(arguments, **EARLY))
+    defaults = Collection(suite=config.suite, demonstrations=config.demonstrations)
+    args = parse(Arguments, __doc__ or "", arguments, Arguments(defaults))
     store = open_store()
     announce(demonstrations=(store.root, f"{DATA}=FOLDER"))
-    experiment = Experiment(args.experiment, store)
+    experiment = Experiment(config.model_copy(update=dict(args.collection)), store)
     clock = Clock()
     with open_runner(args.runner, experiment.suite, args.workers) as runner:
         clock.lap("start")

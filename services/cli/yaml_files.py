@@ -28,7 +28,8 @@ def merged(settings: Mapping[str, Any], values: Mapping[Any, Any], origin: str, 
         if key not in result:
             named = key if isinstance(key, str) and len(key) < 50 else shorten(key)
             raise UserError(
-                f"{origin}: got the unknown key {prefix}{named}; wanted one of {', '.join(result)}{nearest(key, result)}"
+                f"{origin}: got the unknown key {prefix}{named}; wanted one of {', '.join(result)}"
+                f"{nearest(key, result)}"
             )
         if isinstance(result[key], dict):
             if not isinstance(value, dict):

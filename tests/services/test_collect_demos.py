@@ -80,7 +80,7 @@ def test_inspect_replays_in_the_kitchen(tmp_path: Path, capsys: pytest.CaptureFi
     monkeypatch.setenv("DMIL_DATA", str(tmp_path))
     flags = (
         "--suite kitchen --suite.train-tasks light --suite.test-tasks light --runner local --demonstrations.per-task 2 "
-        "--demonstrations.held-out 1 --demonstrations.noise 0 --evaluation.shots 1 --evaluation.support-draws 1"
+        "--demonstrations.held-out 1 --demonstrations.noise 0"
     )
     collect_demos.run(flags.split())
     (folder,) = tmp_path.glob("kitchen/light/*")
