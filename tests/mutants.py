@@ -34,7 +34,7 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
     },
     ("dmil_core/loss_gradients.py", "dmil_core/test_loss_gradients.py"): {
         "self.add_to(stepped, -learning_rate)": "self.add_to(stepped, -1.0)",
-        "weight.addmm_(deltas[index].mT, tangent[index - 1], alpha=-learning_rate)": "pass",
+        "add_product(weight, deltas[index].mT, tangent[index - 1], -learning_rate)": "pass",
     },
     ("dmil_core/methods/dmil/meta_gradient.py", "dmil_core/methods/dmil/test_meta_gradient.py"): {
         "in reversed(path)": "in path",
@@ -48,7 +48,7 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
     },
     ("dmil_core/outer_loop.py", "dmil_core/test_outer_loop.py"): {
         "draw.permutation(len(tasks))": "draw.integers(len(tasks), size=len(tasks))",
-        "torch.tensor(float(state.iteration))": "torch.tensor(0.0)",
+        "there(float(state.iteration))": "there(0.0)",
         "        size *= 2": "        size += 1",
     },
     ("dmil_core/seeding.py", "dmil_core/test_seeding.py"): {
@@ -148,7 +148,7 @@ def copy_of_the_tree(folder: Path) -> Path:
     known = subprocess.run(["git", "ls-files", "-z"], cwd=PROJECT, check=True, capture_output=True, text=True).stdout
     for name in filter(None, known.split("\0")):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(PROJECT / name, folder / name)
+        shutil.copy(PROJECT / name, folder / name, follow_symlinks=False)
     return folder
 
 

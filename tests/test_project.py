@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.mutants import misplaced
+
 PROJECT = Path(__file__).parents[1]
 PRUNED = {"build", "dist", "data", "runs"}
 FILES = [
@@ -192,3 +194,7 @@ def test_files_of_folders_are_opened_in_one_way():
     ours = {str(path.relative_to(PROJECT)): path for path in FILES if path.relative_to(PROJECT).parts[0] in PACKAGES}
     found = {name: opened_by_hand(path.read_text("utf-8")) for name, path in ours.items() if name not in FREE}
     assert {name: calls for name, calls in found.items() if calls} == BY_HAND, "see dmil_core/files.py"
+
+
+def test_the_faults_of_make_mutants_have_their_places():
+    assert misplaced() == []
