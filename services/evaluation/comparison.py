@@ -59,9 +59,11 @@ Outcomes = Mapping[int, SeedOutcomes]
 
 
 @dataclass(frozen=True)
-class SeedEvaluation(EvaluationFolder):
+class SeedEvaluation:
     """One seed of a row on a suite: a configuration that was trained, and an evaluation of it."""
 
+    measured: EvaluationFolder
+    """What was evaluated."""
     row: str
     suite: str
     seed: int
@@ -167,7 +169,7 @@ class Comparison:
         outcomes: dict[CellKey, dict[int, SeedOutcomes]] = defaultdict(dict)
         for evaluation in self.evaluations:
             groups: dict[tuple[Split, int], list[EpisodeResult]] = defaultdict(list)
-            for episode in evaluation.episodes:
+            for episode in evaluation.measured.episodes:
                 groups[episode.split, episode.shots].append(episode)
             for (split, shots), group in groups.items():
                 seeds = outcomes[CellKey(evaluation.row, evaluation.suite, split, shots)]
@@ -185,7 +187,7 @@ class Comparison:
         """Return the mean of a cell's outcomes with its interval, beside the paper's figure."""
         outcomes, paper = self.outcomes[key], self.published.get(key)
         evaluations = [of for of in self.evaluations if (of.row, of.suite) == (key.row, key.suite)]
-        use = sub_skill_shares([row for of in evaluations for row in of.adaptations if row.shots == key.shots])
+        use = sub_skill_shares([row for of in evaluations for row in of.measured.adaptations if row.shots == key.shots])
         seeds = sorted(outcomes)
         values = np.stack([outcomes[seed].outcomes for seed in seeds])
         if len(seeds) > 1:
@@ -243,7 +245,7 @@ def _seed_outcomes(rows: Sequence[EpisodeResult], metric: Metric, evaluation: Se
 
 def _other_episodes(evaluation: SeedEvaluation, got: tuple[int, ...]) -> UserError:
     return UserError(
-        f"{evaluation.folder}: got rows of {evaluation.row} with not as many episodes of each task and seed: "
+        f"{evaluation.measured.folder}: got rows of {evaluation.row} with not as many episodes of each task and seed: "
         f"{', '.join(map(str, got))}; remove the folder, in a sweep also trials/{evaluation.name}/result.json, and "
         "evaluate again"
     )

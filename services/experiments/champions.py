@@ -15,6 +15,7 @@ from dmil_core.errors import RunError, UserError
 from services.demonstrations.store import TaskDemonstrations
 from services.distributed.runner import Runner
 from services.evaluation.comparison import Comparison, Difference, SeedEvaluation, Unpaired
+from services.evaluation.results import EvaluationFolder
 from services.evaluation.summary import Evaluation
 from services.experiments.experiment import Experiment
 from services.storage.redaction import error_line, redacted
@@ -171,7 +172,7 @@ class Promotion:
         ours, theirs = f"version {version}", f"version {self.champion.version}"
         evaluations = [
             SeedEvaluation(
-                folder=rows,
+                measured=EvaluationFolder(rows),
                 row=row,
                 suite=name,
                 seed=config.seed,

@@ -83,6 +83,7 @@ def _row_name(names: Sequence[str]) -> str:
 
 def _evaluation(row: str, name: str, run: FinishedRun) -> SeedEvaluation:
     return SeedEvaluation(
+        measured=run,
         row=row,
         suite=run.config.suite.name,
         seed=run.config.seed,
@@ -90,5 +91,4 @@ def _evaluation(row: str, name: str, run: FinishedRun) -> SeedEvaluation:
         config=run.config,
         environment_steps=run.summary.environment_steps,
         home=run.folder,
-        folder=run.folder,
     )

@@ -40,6 +40,8 @@ class Storage:
         except (ValueError, OSError) as error:  # OSError: a kind that connects at once
             raise UserError(f"{STORAGE}: got {self.url} ({redacted(str(error))}); wanted a URL as {KINDS}") from error
         self._root = root.rstrip("/")
+        if "://" not in url or not self._root:
+            raise UserError(f"{STORAGE}: got {self.url}, which names no folder and no bucket; wanted a URL as {KINDS}")
 
     def put(self, name: str, content: bytes) -> None:
         """Write a file whole."""

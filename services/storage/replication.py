@@ -146,8 +146,8 @@ class Replica:
     def restore(self) -> bool:
         """Fetch what the folder lacks; return whether there was anything.
 
-        Of checkpoints the newest whole one is fetched, if it is newer than all whole ones in the folder; then the
-        records too.
+        Checkpoints that the folder does not have are fetched as far as they are whole, the older ones too, which the
+        next copy would else remove there; then the records.
 
         Raises:
             RunError: if the copy cannot be used.
@@ -156,7 +156,10 @@ class Replica:
             return False
         records = {name: self._get(name) for name in (CLAIM, *RECORDS)}
         newer = self._newer()
-        if newer and not any(map(self._fetched, newer)):
+        stored = self._storage.committed(f"{self._name}/checkpoints", MARKER, NAMED)
+        lacking = stored.keys() - {path.name for path in self._checkpoints.all()} - set(newer)
+        fetched = [name for name in (*newer, *sorted(lacking)) if self._fetched(name)]
+        if newer and not set(newer) & set(fetched):
             if self._checkpoints.newest_whole() is not None:
                 return False
             raise RunError(
@@ -252,10 +255,12 @@ def restored(folder: Path) -> bool:
             return replica.restore()
     except UserError:
         raise
-    except Exception as error:  # noqa: BLE001  whatever a storage raises
+    except Exception as error:
         if (folder / SETTINGS).is_file():
             logger.warning(f"{storage.url} does not give {folder} ({error_line(error)}); going on with what is here")
             return False
+        if isinstance(error, RunError):
+            raise
         raise RunError(
             f"{storage.url} does not give {folder}: {error_line(error)}; wanted the run; try again"
         ) from None

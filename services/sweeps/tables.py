@@ -9,7 +9,7 @@ from pydantic import BaseModel
 from services.cli.composition import with_evaluation
 from services.evaluation.comparison import Cell, CellKey, Comparison, Difference, SeedEvaluation, Unpaired
 from services.evaluation.paper_results import figure
-from services.evaluation.results import Metric
+from services.evaluation.results import EvaluationFolder, Metric
 from services.sweeps.folders import SweepFolder
 from services.sweeps.settings import PlannedTrial
 
@@ -95,6 +95,7 @@ def _evaluations(sweep: SweepFolder) -> Iterator[SeedEvaluation]:
             continue
         for row, folder in result.evaluated.items():
             yield SeedEvaluation(
+                measured=EvaluationFolder(sweep.runs / folder),
                 row=row,
                 suite=suite_of(trial),
                 seed=trial.seed,
@@ -102,7 +103,6 @@ def _evaluations(sweep: SweepFolder) -> Iterator[SeedEvaluation]:
                 config=with_evaluation(trial.config, trial.evaluations[row]),
                 environment_steps=result.environment_steps,
                 home=sweep.of_trial(name),
-                folder=sweep.runs / folder,
             )
 
 

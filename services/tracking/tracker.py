@@ -72,7 +72,7 @@ class Tracker:
         """Lines that say where the MLflow run is, as far as it is known, and how to look at it."""
         run_id, experiment_id, uri = self.run_id, self._delivery.identity.experiment_id, tracking_uri()
         if run_id is None or not self._delivery.found:
-            return [f"MLflow run: {run_id or 'none'}, not found at {self.uri}"]
+            return [f"MLflow run: {f'{run_id}, which took no records' if run_id else 'none yet'} at {self.uri}"]
         lines = [f"MLflow run: {run_id} at {self.uri}"]
         if (command := ui_command(uri)) is not None:
             lines.append(f"to look at it: {command}")

@@ -15,6 +15,7 @@ from services import meta_train, reproduce
 from services.cli.arguments import exit_code
 from services.experiments.finished_run import FinishedRun
 from services.local_cluster import Started
+from services.reporting.comparison import compare_runs
 from services.storage.checkpoints import Checkpoints
 from services.storage.remote import STORAGE, Storage
 from services.storage.replication import Replica, restored
@@ -49,6 +50,17 @@ def test_a_checkpoint_that_is_damaged_here_is_fetched(copied: tuple[Path, Path])
     assert restored(here)
     assert newest(here).digest == before.digest
     assert not restored(here), "all is here"
+
+
+def test_older_checkpoints_are_fetched_too_and_stay_there(copied: tuple[Path, Path]):
+    here, there = copied
+    before = {path.name: Checkpoint(path).digest for path in (here / "checkpoints").iterdir()}
+    shutil.rmtree(here)
+    assert restored(here)
+    Replica(here, Storage(there.parents[1].as_uri())).copy()
+    for folder in copied:
+        assert {path.name: Checkpoint(path).digest for path in (folder / "checkpoints").iterdir()} == before
+    assert len(before) == 2
 
 
 def test_what_is_damaged_there_is_not_taken_and_not_kept(copied: tuple[Path, Path], logged):
@@ -157,6 +169,8 @@ def test_another_run_s_checkpoint_and_rows_are_told(train, complaint):
     shutil.copy(other / "episodes.jsonl", one / "episodes.jsonl")
     with pytest.raises(ValueError, match=r"one/episodes\.jsonl: checkpoint: got rows of .*summary\.json says"):
         _ = FinishedRun(one).episodes
+    with pytest.raises(ValueError, match=r"one/episodes\.jsonl: checkpoint: got rows of"):
+        _ = compare_runs([FinishedRun(other), FinishedRun(one)]).cells
     assert FinishedRun(one).adaptations
     shutil.copytree(other / "checkpoints" / "iteration-0000006", one / "checkpoints" / "iteration-0000006")
     printed = complaint(meta_train.run, "--resume", "one", "--runner", "local", "--training.iterations", "8")

@@ -261,6 +261,8 @@ def test_a_storage_that_is_away_is_reported_once_and_stops_nothing(
     [
         ("nothing://bucket", "DMIL_STORAGE: got nothing://bucket"),
         ("gs://bucket/lab", "pip install gcsfs"),
+        ("s3://", "DMIL_STORAGE: got s3://, which names no folder and no bucket; wanted a URL as "),
+        ("bucket/lab", "DMIL_STORAGE: got bucket/lab, which names no folder"),
     ],
 )
 def test_a_url_that_names_no_storage_is_a_mistake(url: str, message: str, monkeypatch, workplace: Path, complaint):

@@ -57,7 +57,7 @@ def test_what_was_not_delivered_is_delivered_by_the_next_tracker(
     tracker.metrics(1, {"loss": 1.0})
     assert not tracker.close("KILLED")
     assert tracker.run_id is None
-    assert tracker.address_lines == [f"MLflow run: none, not found at {tracker.uri}"]
+    assert tracker.address_lines == [f"MLflow run: none yet at {tracker.uri}"]
 
     monkeypatch.setenv("MLFLOW_TRACKING_URI", mlflow_file)
     again = Tracker(tmp_path, "waiting")
@@ -70,7 +70,7 @@ def test_what_was_not_delivered_is_delivered_by_the_next_tracker(
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"{mlflow_file}.other")
     elsewhere = Tracker(tmp_path, "waiting")
     assert not elsewhere.close("FINISHED")
-    assert elsewhere.address_lines == [f"MLflow run: {again.run_id}, not found at {mlflow_file}.other"]
+    assert elsewhere.address_lines == [f"MLflow run: {again.run_id}, which took no records at {mlflow_file}.other"]
 
     run = MlflowClient(mlflow_file).get_run(str(again.run_id))
     assert run.data.params == {"iterations": "5", "seed": "0"}
