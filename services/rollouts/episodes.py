@@ -14,6 +14,40 @@ from dmil_core.seeding import named_rng, named_seed
 from dmil_core.trajectories import Episode, Rollout
 from services.suites.base import Environment, Expert
 
+RESET = ("observation", "info")
+STEP = ("observation", "reward", "terminated", "truncated", "info")
+"""What the methods of gymnasium's environments return."""
+
+
+def _reset(env: Environment, seed: int) -> object:
+    try:
+        return env.reset(seed=seed)
+    except TypeError as error:
+        if "unexpected keyword argument" not in str(error):
+            raise
+        raise UserError(f"reset: got {error}; wanted gymnasium's reset(*, seed=None, options=None)") from error
+
+
+def _checked(env: Environment, method: str, returned: Any, wanted: tuple[str, ...]) -> Any:
+    """Return what a method of an environment returned, with the observation as an array.
+
+    Raises:
+        UserError: if it is not what `wanted` names, or its observation has not the shape of `observation_space`.
+    """
+    if not isinstance(returned, tuple) or len(returned) != len(wanted):
+        got = f"{len(returned)} values" if isinstance(returned, tuple) else f"a {type(returned).__name__}"
+        raise UserError(
+            f"{method}: got {got}; wanted gymnasium's ({', '.join(wanted)}); an environment of the older gym needs a "
+            "wrapper"
+        )
+    observation, shape = np.asarray(returned[0]), env.observation_space.shape
+    if observation.shape != shape:
+        raise UserError(
+            f"{method}: got an observation of the shape {observation.shape}; wanted {shape}, as its observation_space "
+            "says"
+        )
+    return observation, *returned[1:]
+
 
 class _Recorder:
     """Resets an environment, and records all steps of the episode that begins.
@@ -23,7 +57,7 @@ class _Recorder:
 
     def __init__(self, env: Environment, seed: int) -> None:
         self._env, self._seed = env, seed
-        self.observation, self.info = env.reset(seed=seed)
+        self.observation, self.info = _checked(env, "reset", _reset(env, seed), RESET)
         self._goal: list[float] = np.array(self.info.get("goal", []), np.float64).ravel().tolist()
         self.observations = [self.observation.astype(np.float32)]
         self.actions: list[np.ndarray] = []
@@ -34,7 +68,7 @@ class _Recorder:
 
     def step(self, executed: np.ndarray, recorded: np.ndarray) -> None:
         """Execute an action; the one that is recorded need not be the same."""
-        self.observation, _, _, _, self.info = self._env.step(executed)
+        self.observation, _, _, _, self.info = _checked(self._env, "step", self._env.step(executed), STEP)
         if (success := self.info.get("success", self.info.get("is_success"))) is None:
             raise UserError(
                 "info of a step: got no success; wanted success or is_success, whether the task is solved; have step() "

@@ -5,13 +5,14 @@ import json
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 from mlflow import MlflowClient
 
-from dmil_core.configs import SuiteConfig
+from dmil_core.configs import DemonstrationConfig, SuiteConfig
 from dmil_core.errors import RunError, UserError
 from services import collect_demos, inspect_demos, meta_train, verify_experts
 from services.cli.arguments import exit_code
@@ -19,6 +20,7 @@ from services.demonstrations.external import demonstrations, read_episodes
 from services.distributed.ray_runner import put_suite
 from services.evaluation.results import EpisodeResult, read_rows
 from services.experiments import experiment
+from services.rollouts.episodes import demonstrate
 from tests.faults import toy_suite
 from tests.faults.conftest import TOY
 
@@ -38,6 +40,56 @@ def test_arrays_in_infos_are_taken(train, workplace: Path, monkeypatch):
 def test_a_missing_success_is_one_message(workplace: Path, monkeypatch, complaint, program):
     monkeypatch.setenv("TOY_ODDITY", "no success")
     assert "info of a step: got no success; wanted success or is_success, whether" in complaint(program, *TOY)
+
+
+class Odd(toy_suite.PointEnv):
+    """Returns what `changed` makes of what gymnasium wants, from one of its methods."""
+
+    def __init__(self, method: str, changed: Callable[[Any], Any]) -> None:
+        super().__init__(1, "")
+        self._method, self._changed = method, changed
+
+    def reset(self, **given: Any) -> Any:
+        returned = super().reset(**given)
+        return self._changed(returned) if self._method == "reset" else returned
+
+    def step(self, action: np.ndarray) -> Any:
+        returned = super().step(action)
+        return self._changed(returned) if self._method == "step" else returned
+
+
+class Seedless(toy_suite.PointEnv):
+    """Is reset as environments of the older gym are."""
+
+    def reset(self) -> Any:  # type: ignore[override]
+        return super().reset()
+
+
+@pytest.mark.parametrize(
+    ("env", "words"),
+    [
+        (Odd("reset", lambda it: it[0]), r"reset: got a ndarray; wanted gymnasium's \(observation, info\)"),
+        (Odd("step", lambda it: it[1:]), r"step: got 4 values; wanted gymnasium's \(observation, reward, terminated"),
+        (
+            Odd("step", lambda it: (it[0][None], *it[1:])),
+            r"step: got an observation of the shape \(1, 4\); wanted \(4,\)",
+        ),
+        (
+            Odd("reset", lambda it: ({"at": it[0]}, it[1])),
+            r"reset: got an observation of the shape \(\); wanted \(4,\)",
+        ),
+        (Seedless(1, ""), r"reset: got .*'seed'; wanted gymnasium's reset\(\*, seed=None, options=None\)"),
+    ],
+)
+def test_what_is_not_gymnasium_s_is_named(env: Any, words: str):
+    with pytest.raises(UserError, match=words):
+        demonstrate(toy_suite.Expert(1), env, 0, 30, DemonstrationConfig())
+
+
+def test_lists_are_observations_too():
+    listed = Odd("step", lambda it: (it[0].tolist(), *it[1:]))
+    episodes = [demonstrate(toy_suite.Expert(1), env, 0, 30, DemonstrationConfig()) for env in (listed, Odd("", list))]
+    assert np.array_equal(episodes[0].observations, episodes[1].observations)
 
 
 def test_an_observation_that_the_simulator_spoils_is_no_failure_of_the_policy(
