@@ -324,8 +324,10 @@ def remove_file(root: Path, name: Name) -> None:
         os.unlink(PurePath(name).name, dir_fd=folder)
 
 
-def copy_plain(root: Path, name: Name, target: Path) -> None:
-    """Copy a file, or the regular files of a folder, into the folder `target`; links in it are left out, and the like.
+def copy_plain(root: Path, name: Name, target: Path) -> list[Path]:
+    """Copy a file, or the regular files of a folder, into the folder `target`, and return what of it was left out.
+
+    Links in the folder are, and the like.
 
     Raises:
         ForeignFileError: for a link on the way, and for what is neither file nor folder.
@@ -338,6 +340,7 @@ def copy_plain(root: Path, name: Name, target: Path) -> None:
             made = open_descriptor(target, path.relative_to(base), os.O_WRONLY | os.O_CREAT | os.O_EXCL)
             with os.fdopen(made, "wb") as copy, open_file(root, path.relative_to(root)) as content:
                 shutil.copyfileobj(content, copy)
+    return [path for path in found if not (stat.S_ISREG(mode := path.lstat().st_mode) or stat.S_ISDIR(mode))]
 
 
 def sync(path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from dmil_core.checkpoint import Checkpoint, CheckpointError
 from dmil_core.checksums import sha256
+from dmil_core.errors import shorten
 from dmil_core.files import ForeignFileError, copy_plain, inside
 from services.tracking.models import log_model
 from services.tracking.spool import Artifact, Line, Measured, Trained
@@ -115,14 +116,18 @@ def _send_artifact(client: "MlflowClient", run_id: str, folder: Path, value: Art
     """Send a file, or the regular files of a folder; what links in it lead to is not the run's, and stays here."""
     with TemporaryDirectory() as made:
         try:
-            copy_plain(folder, value.path, Path(made))
+            left_out = copy_plain(folder, value.path, Path(made))
         except FileNotFoundError:
             missing = "was gone before MLflow could be given it"
         except ForeignFileError as error:
             missing = str(error)
         else:
+            if left_out:
+                names = shorten([path.name for path in left_out])
+                logger.warning(f"{value.path}: not sent to MLflow, as they are no plain files: {names}")
             client.log_artifacts(run_id, made, value.folder)
             return
+    logger.warning(f"{value.path}: not sent to MLflow: {missing}")
     _send_tags(client, run_id, {f"missing.{value.path}": missing})
 
 

@@ -163,7 +163,7 @@ class Tracker:
                 timeout = min(timeout, CLOSING_SECONDS)
         self._spool.close()
         left = self.waiting
-        if left:
+        if left and self._spool.path.exists():  # they may have gone with the run's folder
             logger.warning(
                 f"{left} of {self._spool.count} MLflow records wait in {self._spool.path}; when MLflow answers again: "
                 f"dmil tracking flush {self._folder}"
@@ -188,7 +188,7 @@ class Tracker:
         try:
             self._delivery.deliver()
         except Exception as error:  # noqa: BLE001  whatever MLflow raises, training goes on
-            if not self._complained:
+            if not self._complained and self._spool.path.exists():
                 logger.warning(
                     f"MLflow at {self.uri} does not take records ({error_line(error)}); training goes on, "
                     f"records wait in {self._spool.path}"

@@ -252,7 +252,9 @@ def test_a_removed_folder_ends_the_run_in_a_line(workplace, monkeypatch, capsys)
 
     monkeypatch.setattr(meta_training.IterationLog, "add", removing)
     assert exit_code(meta_train.run, [*TOY, *SHORT, "--name", "run"]) == 1
-    assert "error: runs/run: got no such folder any more" in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert "error: runs/run: got no such folder any more" in said.err
+    assert "records wait" not in said.out + said.err, "they went with it"
     assert not (workplace / "runs" / "run").exists()
 
 

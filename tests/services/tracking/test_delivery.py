@@ -143,7 +143,7 @@ def test_an_artifact_that_is_gone_does_not_hold_up_the_others(tmp_path: Path, ml
     assert run.data.tags["missing.gone.md"] == "was gone before MLflow could be given it"
 
 
-def test_only_files_of_the_run_s_folder_are_sent(tmp_path: Path, mlflow_file: str, monkeypatch):
+def test_only_files_of_the_run_s_folder_are_sent(tmp_path: Path, mlflow_file: str, monkeypatch, logged):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", mlflow_file)
     monkeypatch.chdir(tmp_path)
     private, run = tmp_path / "private", tmp_path / "run"
@@ -171,3 +171,6 @@ def test_only_files_of_the_run_s_folder_are_sent(tmp_path: Path, mlflow_file: st
     assert {name for name in tags if name.startswith("missing.")} == {
         "missing.notes", "missing.folder", "missing.folder/key", "missing.report/own/more/deep", "missing.report/pipe",
     }  # fmt: skip
+    said = "\n".join(logged())
+    assert f"notes: not sent to MLflow: {run / 'notes'}: got a link" in said
+    assert "report: not sent to MLflow, as they are no plain files: ['figure', 'more', 'pipe']" in said
