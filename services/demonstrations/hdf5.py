@@ -55,8 +55,13 @@ class PlainFile:
             DemonstrationError: if there is none, it lies outside the file, holds no numbers, or is too large.
         """
         array = self._member(name)
-        if not isinstance(array, h5py.Dataset) or array.is_virtual or array.external:
-            raise DemonstrationError(f"{name}: got no array of this file; wanted one")
+        if not isinstance(array, h5py.Dataset):
+            got = "nothing" if array is None else "a group"
+            raise DemonstrationError(f"{name}: got {got}; wanted an array of numbers")
+        if array.is_virtual or array.external:
+            raise DemonstrationError(
+                f"{name}: got numbers that lie in another file, which is not read; wanted them copied into this one"
+            )
         if array.dtype.kind not in "fiub" or (array.ndim < 1 if axes is None else array.ndim != axes):
             wanted = "numbers with an axis of steps" if axes is None else f"numbers with {axes} axes"
             raise DemonstrationError(f"{name}: got {array.dtype} of the shape {array.shape}; wanted {wanted}")
