@@ -113,7 +113,7 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
         '"yes, higher" if low > 0': '"yes, higher" if high > 0',
     },
     ("services/cli/composition.py", "services/cli/test_arguments.py"): {
-        "suite or named or DEFAULT_SUITE": "named or suite or DEFAULT_SUITE",
+        "suite or named or DEFAULT_SUITE": "named or DEFAULT_SUITE",
     },
     ("services/cli/arguments.py", "services/cli/test_arguments.py"): {
         "2 if isinstance(error, UserError) else 1": "1",
