@@ -90,21 +90,24 @@ def _start(folder: Path, **options: Any) -> None:
             ray.init(**options, _temp_dir=str(folder))
             return
         except Exception as error:  # Ray raises plain ones
+            _end_children_of(folder)
             if last or "timed out during startup" not in str(error):
                 raise RunError(
                     f"Ray does not start on this machine: {error_line(error)}; start again, with less beside it, or "
                     "without Ray: --runner local"
                 ) from error
             logger.warning("Ray is slow to start here; it is started once more")
-            _end_children_of(folder)
 
 
 def _end_children_of(folder: Path) -> None:
-    """End the processes below this one that were told to work in a folder."""
+    """End the processes below this one that were told to work in a folder: they would make it anew."""
+    ended = []
     for process in psutil.Process().children(recursive=True):
         with suppress(psutil.Error):
             if any(str(folder) in part for part in process.cmdline()):
                 process.kill()
+                ended.append(process)
+    psutil.wait_procs(ended, SECONDS_TO_ANSWER)
 
 
 def named_address() -> str | None:

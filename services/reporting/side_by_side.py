@@ -279,8 +279,8 @@ def _flat(evaluation: SeedEvaluation) -> dict[str, str]:
             settings_by_name[f"{section}.{name}"] = (
                 ", ".join(map(str, value)) if isinstance(value, list) else str(value)
             )
-    data = {f"{row.task} {row.data}" for row in evaluation.episodes}
-    versions = evaluation.episodes[0].versions if evaluation.episodes else {}
+    data = {f"{row.task} {row.data}" for row in evaluation.measured.episodes}
+    versions = evaluation.measured.episodes[0].versions if evaluation.measured.episodes else {}
     settings_by_name["data sets' SHA-256"] = sha256("\n".join(sorted(data)).encode())[:12]
     return settings_by_name | {f"version of {name}": version for name, version in versions.items()}
 
@@ -289,7 +289,7 @@ def _runs(comparison: Comparison) -> list[Part]:
     rows = []
     for evaluation in comparison.evaluations:
         steps_taken = f"{evaluation.environment_steps:,}" if evaluation.environment_steps else ""
-        checkpoint = evaluation.episodes[0].checkpoint[:12] if evaluation.episodes else ""
+        checkpoint = evaluation.measured.episodes[0].checkpoint[:12] if evaluation.measured.episodes else ""
         which = [evaluation.name, evaluation.row, evaluation.suite, f"{evaluation.seed}", evaluation.config.method.name]
         rows.append([*which, f"{evaluation.config.training.iterations}", steps_taken, checkpoint])
     head = ["run", "row", "suite", "seed", "method", "iterations", "environment steps", "checkpoint"]

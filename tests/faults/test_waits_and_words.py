@@ -92,8 +92,12 @@ def test_a_checkpoint_of_another_program_is_named(workplace: Path, complaint, co
         assert f"--checkpoint: got '{place}'; wanted the folder of a run or of a checkpoint" in printed
 
 
-def test_ray_that_does_not_come_up_is_one_line(monkeypatch, capsys):
+def test_ray_that_does_not_come_up_is_one_line_and_leaves_nothing(monkeypatch, capsys):
+    begun = []
+
     def slow(**options: object) -> None:
+        wait = "import time; time.sleep(600)"
+        begun.append(subprocess.Popen([sys.executable, "-c", wait, f"--temp-dir={options['_temp_dir']}"]))
         raise Exception("The current node timed out during startup.")
 
     import ray
@@ -110,6 +114,8 @@ def test_ray_that_does_not_come_up_is_one_line(monkeypatch, capsys):
     said = capsys.readouterr().err
     assert "Ray does not start on this machine: Exception: The current node timed out" in said
     assert "--runner local" in said
+    assert [process.wait() for process in begun] == [-signal.SIGKILL] * 2
+    assert not any(Path(str(process.args[-1]).partition("=")[2]).parent.exists() for process in begun)
 
 
 def test_cpus_are_those_that_the_process_may_use():
