@@ -116,9 +116,8 @@ def read_episodes(place: str) -> list[ExternalEpisode]:
         raise DemonstrationError(f"{place}: {error}") from error
     # What h5py raises of files that are not what they look like.
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise DemonstrationError(
-            f"{place}: got {type(error).__name__}, {error}; wanted a data set as docs/data.md describes"
-        ) from error
+        got = f"no {error.filename}" if isinstance(error, FileNotFoundError) else f"{type(error).__name__}, {error}"
+        raise DemonstrationError(f"{place}: got {got}; wanted a data set as docs/data.md describes") from error
 
 
 def demonstrations(task: str, place: str, suite: TaskSuite, most: int) -> TaskDemonstrations:

@@ -123,7 +123,7 @@ def test_each_data_set_is_that_of_one_task():
 
 
 ODD = {
-    "no such file": (lambda root: f"hdf5:{root / 'none.hdf5'}", "FileNotFoundError"),
+    "no such file": (lambda root: f"hdf5:{root / 'none.hdf5'}", "none.hdf5; wanted a data set"),
     "no such npz": (lambda root: f"npz:{root / 'none.npz'}", "No such file"),
     "no such id": (lambda root: "minari:no/such-v0", "minari download no/such-v0"),
     "elsewhere": (lambda root: "minari:../../etc", "lies outside"),
