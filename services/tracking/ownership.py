@@ -5,6 +5,7 @@ else hands over can say that it belongs to any run.
 """
 
 import json
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
@@ -48,10 +49,16 @@ def check_place(client: "MlflowClient", uri: str, experiment: "Experiment") -> N
         own = "mlflow-artifacts:/" if served else f"{root}/{experiment.experiment_id}"
     if place != own:
         raise UserError(
-            f"MLflow's experiment {experiment.name!r} keeps artifacts in {redacted(place)}; wanted {redacted(own)}, as "
-            f"of any experiment there: somebody made it for another place; mlflow experiments rename --experiment-id "
-            f"{experiment.experiment_id} --new-name NAME, and a new one is made"
+            f"MLflow's experiment {experiment.name!r} keeps artifacts in {redacted(place) or 'no place'}; wanted "
+            f"{redacted(own)}, as of any experiment there: somebody made it for another place; "
+            f"{_mlflow('experiments', 'rename', '--experiment-id', experiment.experiment_id)} --new-name NAME, and a "
+            "new one is made"
         )
+
+
+def _mlflow(*words: str) -> str:
+    """Return a command as it can be pasted, whatever ids a server gives."""
+    return shlex.join(["mlflow", *words])
 
 
 def check_active(experiment: "Experiment") -> None:
@@ -62,8 +69,8 @@ def check_active(experiment: "Experiment") -> None:
     """
     if experiment.lifecycle_stage == "deleted":
         raise RunError(
-            f"MLflow's experiment {experiment.name!r} was deleted there; records wait until it is restored: mlflow "
-            f"experiments restore --experiment-id {experiment.experiment_id}"
+            f"MLflow's experiment {experiment.name!r} was deleted there; records wait until it is restored: "
+            f"{_mlflow('experiments', 'restore', '--experiment-id', experiment.experiment_id)}"
         )
 
 
@@ -77,8 +84,8 @@ def check_there(client: "MlflowClient", run_id: str) -> "Run":
     check_active(client.get_experiment(run.info.experiment_id))
     if run.info.lifecycle_stage == "deleted":
         raise RunError(
-            f"MLflow's run {run_id} was deleted there; records wait until it is restored: mlflow runs restore --run-id "
-            f"{run_id}"
+            f"MLflow's run {run_id} was deleted there; records wait until it is restored: "
+            f"{_mlflow('runs', 'restore', '--run-id', run_id)}"
         )
     return run
 

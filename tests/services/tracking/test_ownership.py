@@ -1,17 +1,18 @@
 """Whose a run in MLflow is, and where its artifacts go: compared before anything is sent."""
 
 import json
+import re
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from mlflow import MlflowClient
 from mlflow.entities import Experiment
 
-from dmil_core.errors import UserError
+from dmil_core.errors import RunError, UserError
 from services.tracking.delivery import Delivery, Identity
-from services.tracking.ownership import FOLDER_TAG, IDENTITY, check_model, check_place
+from services.tracking.ownership import FOLDER_TAG, IDENTITY, check_active, check_model, check_place
 from services.tracking.tracker import Tracker
 
 
@@ -107,3 +108,12 @@ def test_a_server_s_experiments_keep_their_artifacts_behind_it(mlflow_server, tm
         elsewhere = Experiment(made.experiment_id, "elsewhere", place, "active")
         with pytest.raises(UserError, match=r"'elsewhere' keeps artifacts in .*; wanted mlflow-artifacts:/"):
             check_place(client, mlflow_server.uri, elsewhere)
+
+
+@pytest.mark.parametrize("id_", ["1; touch made", "$(touch made)", "--new-name x"])
+def test_a_command_to_paste_runs_nothing_that_a_server_says(tmp_path: Path, id_: str):
+    made, unasked = Experiment(id_, "ours", "file:///elsewhere", "deleted"), cast("MlflowClient", None)
+    with pytest.raises(RunError, match=re.escape(f"--experiment-id '{id_}'")):
+        check_active(made)
+    with pytest.raises(UserError, match=re.escape(f"--experiment-id '{id_}' --new-name NAME")):
+        check_place(unasked, f"sqlite:///{tmp_path}/mlflow.db", made)
