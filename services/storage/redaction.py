@@ -56,7 +56,8 @@ def _own_secrets() -> set[str]:
     plain = {os.environ.get(name, "") for name in SECRETS}
     for name in ADDRESSES:
         found = URL.search(os.environ.get(name, ""))
-        plain |= {found["user"][:-1].partition(":")[2]} if found else set()
+        password = found["user"][:-1].partition(":")[2] if found else ""
+        plain |= {password, *re.split("[@/]", password)}  # whoever reads the URL otherwise shows a part
     forms = {form for secret in plain for form in (secret, unquote(secret), quote(secret, safe=""))}
     return {secret for secret in forms if len(secret) >= MIN_SECRET}
 

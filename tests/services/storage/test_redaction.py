@@ -36,3 +36,11 @@ def test_secrets_of_this_process_are_hidden_wherever_they_stand(name: str, monke
     monkeypatch.setenv(name, secret if "TOKEN" in name else f"http://me:{quote(secret, safe='')}@host/x")
     for form in (secret, quote(secret, safe="")):
         assert redacted(f"login failed: me, {form!r}, denied") == "login failed: me, '...', denied"
+
+
+def test_parts_of_a_password_that_was_not_quoted_are_hidden(monkeypatch: pytest.MonkeyPatch):
+    """Libraries take what is behind its at sign for the host, and show the rest as a path."""
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://me:left@host/right@127.0.0.1:9/x")
+    assert (
+        redacted("no answer from 'host', url: /right@127.0.0.1:9/x") == "no answer from '...', url: /...@127.0.0.1:9/x"
+    )

@@ -1,8 +1,9 @@
+from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
-from services.tracking.links import comparison_link, run_link, ui_command
+from services.tracking.links import comparison_link, database, run_link, ui_command
 
 
 @pytest.mark.parametrize(
@@ -34,3 +35,8 @@ def test_links_lead_to_the_pages_of_the_server_or_of_mlflow_ui_without_secrets(u
 )
 def test_a_file_is_looked_at_with_a_server_of_one_s_own(uri: str, command: str | None):
     assert ui_command(uri) == command
+
+
+def test_a_database_is_the_file_that_its_address_means():
+    assert database("sqlite:///a b/c%20d.db?timeout=5") == Path("a b/c d.db")
+    assert database("http://host/c.db") is None
