@@ -1,5 +1,6 @@
 """The Ray cluster that this process works in: one that it belongs to, or one of its own on loopback."""
 
+import gc
 import logging
 import os
 import secrets
@@ -52,7 +53,7 @@ def joined(workers: int | None = None) -> Iterator[None]:
     with ExitStack() as stack:
         if address is None:
             folder = stack.enter_context(private_folder())
-            stack.callback(ray.shutdown)
+            stack.callback(_leave)
             _start(
                 folder / "ray",
                 address="local",
@@ -66,7 +67,7 @@ def joined(workers: int | None = None) -> Iterator[None]:
                 _system_config={"enable_metrics_collection": False},  # they would be served to everybody
             )
         else:
-            stack.callback(ray.shutdown)
+            stack.callback(_leave)
             _join(address)
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, on_termination)  # Ray puts its own there, which ends at once
@@ -97,6 +98,22 @@ def _start(folder: Path, **options: Any) -> None:
                     "without Ray: --runner local"
                 ) from error
             logger.warning("Ray is slow to start here; it is started once more")
+
+
+def _leave() -> None:
+    """Leave the cluster, and collect no garbage meanwhile.
+
+    Ray ends the process, without a word, if another thread then frees a reference to an object or an actor.
+    """
+    import ray
+
+    collected = gc.isenabled()
+    gc.disable()
+    try:
+        ray.shutdown()
+    finally:
+        if collected:
+            gc.enable()
 
 
 def _end_children_of(folder: Path) -> None:
