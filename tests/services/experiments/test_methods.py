@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
@@ -49,17 +50,20 @@ def smoke(method: str, iterations: int) -> ExperimentConfig:
 @pytest.mark.usefixtures("joined")
 @pytest.mark.parametrize(
     "method",
-    [method if method == "option-gail" else pytest.param(method, marks=pytest.mark.thorough) for method in LEARNERS],
+    [method if method == "option-gail" else pytest.param(method, marks=pytest.mark.thorough) for method in ONLINE],
 )
 def test_here_and_on_workers_that_are_killed_the_same_bits_come_out(store: DemoStore, data, method: str):
-    """One of two workers is killed, of a method that needs more than gradients; the other methods have one."""
+    """Of methods that need more than gradients, and of one of them with a worker that is killed; the others have one.
+
+    Of those that need gradients alone, `test_a_slot_is_a_pure_function`, and `test_runner` has dmil.
+    """
     mortal = method == "option-gail"
     experiment = Experiment(smoke(method, 4), store)
     wanted = alone(experiment, data)
     assert np.isfinite(wanted.states[-1].parameters).all()
     assert any(map(np.not_equal, wanted.states[-1].parameters, wanted.states[0].parameters))
     steps = [slot.get("environment_steps", 0) for slots in wanted.slots for slot in slots]
-    assert any(steps) == (method in ONLINE)
+    assert any(steps)
     with open_runner("ray", experiment.suite, 2 if mortal else 1) as runner:
         meta_training = runner.meta_train(plan_of(experiment, data))
         assert isinstance(meta_training, RayMetaTraining)
@@ -94,7 +98,7 @@ def test_a_killed_online_run_goes_on_to_the_same_bits(programs, wait_for, workpl
 @pytest.mark.usefixtures("checked_shapes")
 @pytest.mark.parametrize("method", LEARNERS)
 def test_a_slot_is_a_pure_function(store: DemoStore, data, method: str):
-    """Again in a worker that has done other things before: the same bits, and the parameters are as they were."""
+    """Again in another worker, which has done other things before: the same bits, and the parameters as they were."""
     experiment = Experiment(smoke(method, 4), store)
     plan = plan_of(experiment, data)
     sets = experiment.training_sets(data)
@@ -106,6 +110,7 @@ def test_a_slot_is_a_pure_function(store: DemoStore, data, method: str):
         batch = learner.sample(sets["push"], 0, named_rng(3, "batch"))
         found.append(learner.task_gradient(parameters, batch))
         torch.rand(3)
+        learner = deepcopy(learner)  # as one that travels to a worker
     assert torch.equal(found[0].gradient, found[1].gradient)
     assert found[0].metrics == found[1].metrics
     assert "loss" in found[0].metrics
