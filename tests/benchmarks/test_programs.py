@@ -119,9 +119,9 @@ def test_faults(tmp_path: Path) -> None:
 
 @pytest.mark.thorough
 def test_serving(tmp_path: Path) -> None:
-    few = ["--rate", "20", "--seconds", "2", "--mixed-seconds", "15", "--kill-seconds", "5"]
+    few = ["--rate", "20", "--seconds", "2", "--mixed-seconds", "8", "--kill-seconds", "3"]
     act, loop, mixed = rows_of("serving", *few, folder=tmp_path)
-    assert (act["what"], loop["what"], mixed["what"]) == ("act", "control loop", "mixed, 15 s")
+    assert (act["what"], loop["what"], mixed["what"]) == ("act", "control loop", "mixed, 8 s")
     assert act["right"] > 20
     assert mixed["killed"] >= 1
     assert act["wrong"] == loop["wrong"] == mixed["wrong"] == 0
