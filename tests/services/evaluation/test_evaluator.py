@@ -16,7 +16,7 @@ SCHEDULE = (
 )  # fmt: skip
 WAYS = {
     "local": ("--runner", "local"),
-    "beside": ("--runner", "ray", "--workers", "2"),
+    "beside": ("--runner", "ray", "--workers", "1"),
     "in pauses": ("--runner", "ray", "--workers", "1", "--no-overlap-evaluation"),
 }
 
