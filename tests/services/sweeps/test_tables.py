@@ -192,7 +192,7 @@ def test_a_search_is_ranked_and_its_best_is_a_file_of_settings(tmp_path: Path) -
     space = {"method.sub_skills": [2, 3, 4, 5], "method.inner_learning_rate": {"low": 1e-3, "high": 1e-2}}
     suite = {"train_tasks": ["reach"], "test_tasks": ["push"]}
     changes = {"variants": {}, "search": {"space": space, "samples": 3}, "paper": None, "seeds": [0]}
-    sweep = make(tmp_path, better, settings={"suite": suite, "evaluation": {"every": 10}}, **changes)
+    sweep = make(tmp_path, better, settings={"suite": suite, "evaluation": {"every": 500}}, **changes)
     ends = [("stopped", 10, 0.9), ("finished", 20, 0.5), ("finished", 20, 0.7)]
     for name, (status, iteration, held_out) in zip(sweep.trials, ends, strict=True):
         sweep.finish(name, TrialResult.model_validate({"status": status, "iteration": iteration, "held_out": held_out}))
