@@ -68,10 +68,7 @@ def test_a_stopped_job_has_its_checkpoint_and_goes_on_to_the_same_bits(submit, j
     assert iteration >= max(map(int, re.findall(r"^meta-training (\d+)/100000, ", logs, re.MULTILINE)), default=1)
 
     fewer = ("--training.iterations", str(iteration + 2), "--training.checkpoint-every", "50000")
-    again = ("--resume", str(workplace / "runs" / "job"), *ONE)
-    printed = submit("resumed", "meta_train", *again, *fewer, *QUICK_EVALUATION)
-    assert "succeeded" in printed
-    resumed = Checkpoints(workplace / "runs" / "job" / "checkpoints", kept=1).newest()
+    resumed = train("job", *fewer, resume=True)
     assert resumed.manifest.iteration == iteration + 2
     whole = train("whole", *fewer)
     np.testing.assert_array_equal(resumed.state.parameters, whole.state.parameters)

@@ -208,7 +208,6 @@ def descendants(session: str) -> list[psutil.Process]:
     [
         ("local", signal.SIGINT, 130),
         pytest.param("ray", signal.SIGINT, 130, marks=pytest.mark.thorough),
-        pytest.param("ray", signal.SIGTERM, 143, marks=pytest.mark.thorough),
     ],
 )
 def test_a_stopped_run_goes_on_with_the_same_bits(
