@@ -72,7 +72,8 @@ def ended(processes: list[psutil.Process]) -> bool:
 
 
 @pytest.mark.thorough
-def test_a_cluster_takes_jobs_with_its_token_and_leaves_nothing_behind(started, programs, answers, doors):
+def test_a_cluster_takes_jobs_with_its_token_and_leaves_nothing_behind(started, programs, answers, doors, ports):
+    """Nor does one that was killed, once the next is started."""
     folder, printed = started
     dashboard, mlflow = re.findall(r"^(?:Ray dashboard|MLflow): +(\S+)", printed, re.MULTILINE)
     assert answers(dashboard)
@@ -108,11 +109,20 @@ def test_a_cluster_takes_jobs_with_its_token_and_leaves_nothing_behind(started, 
         assert min(found.ports, found.sockets) > 5
         assert found.paths > 50
 
+    there = processes_of(folder)
+    ray = next(own for own in local_cluster.Record.read(folder).processes if own.name == "ray")  # pyright: ignore
+    os.kill(ray.pid, signal.SIGKILL)
+    code, said = programs("local_cluster", "start", *ports)
+    assert code == 0, said
+    assert "a cluster from before ended without being stopped" in said
+    assert ended(there)
+    assert not Path(record["temporary"]).exists()
+
     code, said = programs("local_cluster", "start")
     assert code == 2
     assert f"got a cluster that runs, Ray at {dashboard} and MLflow at {mlflow}" in said
 
-    there = processes_of(folder)
+    there, record = processes_of(folder), json.loads((folder / "cluster.json").read_text())
     code, said = programs("local_cluster", "stop")
     assert code == 0
     assert re.fullmatch(r"stopped: \d\d processes\n", said)
@@ -121,18 +131,6 @@ def test_a_cluster_takes_jobs_with_its_token_and_leaves_nothing_behind(started, 
     code, said = programs("local_cluster", "stop")
     assert code == 2
     assert "got no cluster.json" in said
-
-
-@pytest.mark.thorough
-def test_what_is_left_of_a_killed_cluster_is_stopped_by_the_next_start(started, programs, ports):
-    folder, _ = started
-    there = processes_of(folder)
-    ray = next(own for own in local_cluster.Record.read(folder).processes if own.name == "ray")  # pyright: ignore
-    os.kill(ray.pid, signal.SIGKILL)
-    code, said = programs("local_cluster", "start", *ports)
-    assert code == 0, said
-    assert "a cluster from before ended without being stopped" in said
-    assert ended(there)
 
 
 def test_a_taken_port_is_named_with_who_holds_it(programs, own_token: None, ports: list[str]):
