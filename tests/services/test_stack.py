@@ -41,17 +41,22 @@ class Network:
             **options,
         )  # fmt: skip
 
-    def listens(self, port: int) -> bool:
-        """Ask at little cost, before programs are started that ask more."""
-        return self.run("bash", "-c", f"exec 3<>/dev/tcp/127.0.0.1/{port}").returncode == 0
+    def answers(self, port: int) -> bool:
+        """Tell whether a web server answers with anything at all, which bash asks at little cost."""
+        ask = rf"exec 3<>/dev/tcp/127.0.0.1/{port}; printf 'GET / HTTP/1.0\r\n\r\n' >&3; grep -q ^HTTP/ <&3"
+        return self.run("bash", "-c", ask).returncode == 0
 
-    def start(self, name: str, *command: str, **options: Any) -> None:
+    def log(self, name: str) -> str:
+        """Return what a process has printed."""
+        return (self._folder / f"{name}.log").read_text()
+
+    def start(self, name: str, *command: str, **options: Any) -> subprocess.Popen[Any]:
         with (self._folder / f"{name}.log").open("w") as log:
-            self._processes.append(
-                subprocess.Popen(
-                    [*self._inside, *command], stdout=log, stderr=log, cwd=PROJECT, env=self._environment, **options
-                )
+            process = subprocess.Popen(
+                [*self._inside, *command], stdout=log, stderr=log, cwd=PROJECT, env=self._environment, **options
             )
+        self._processes.append(process)
+        return process
 
     def logs(self) -> str:
         return "\n".join(f"{path}:\n{path.read_text()[-2000:]}" for path in sorted(self._folder.glob("*.log")))
@@ -85,6 +90,7 @@ def network(tmp_path: Path) -> Iterator[Network]:
             "RAY_AUTH_MODE": "token",
             "RAY_AUTH_TOKEN_PATH": str(token),
             "RAY_USAGE_STATS_ENABLED": "0",
+            "PYTHONUNBUFFERED": "1",
             "MLFLOW_TRACKING_URI": "http://127.0.0.1:5000",
             "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
             "MLFLOW_DISABLE_TELEMETRY": "true",
@@ -134,21 +140,22 @@ def test_a_job_on_two_raylets_becomes_a_finished_run_of_mlflow_on_postgres(
         "--dashboard-host=127.0.0.1", f"--temp-dir={temporary}", *common,
     )  # fmt: skip
     client = "import mlflow, sys; c = mlflow.MlflowClient(); "
-    listed = (*ray, "job", "list", "--address", "http://127.0.0.1:8265")
+
+    def is_up(node: str) -> bool:
+        return "Ray runtime started" in network.log(node)
+
     try:
-        wait_for(lambda: network.listens(8265), "a dashboard")
-        wait_for(lambda: network.run(*listed).returncode == 0, "Ray's head")
-        status = (*ray, "status", "--address", "127.0.0.1:6379")
+        wait_for(lambda: is_up("head") and network.answers(8265), "Ray's head")
         for number, address in enumerate(NODES):  # they share a folder here, and one may not find itself in it
-            network.start(
-                f"worker{number}", *ray, "start", "--address=127.0.0.1:6379", f"--node-ip-address={address}",
-                "--num-cpus=1", *common,
-            )  # fmt: skip
-            nodes = number + 2
-            wait_for(lambda n=nodes: network.run(*status).stdout.count(" 1 node_") == n, "a worker")
-        wait_for(lambda: network.listens(5000), "a server")
-        server_answers = (sys.executable, "-c", client + "c.search_experiments()")
-        wait_for(lambda: network.run(*server_answers).returncode == 0, "MLflow")
+            for _ in range(3):  # Ray gives up after 30 s, which a busy machine may need
+                worker = network.start(
+                    f"worker{number}", *ray, "start", "--address=127.0.0.1:6379", f"--node-ip-address={address}",
+                    "--num-cpus=1", *common,
+                )  # fmt: skip
+                wait_for(lambda n=number, w=worker: w.poll() is not None or is_up(f"worker{n}"), "a worker")
+                if worker.poll() is None:
+                    break
+        wait_for(lambda: network.answers(5000), "MLflow")
         submitted = network.run(
             *ray, "job", "submit", "--address", "http://127.0.0.1:8265",
             "--runtime-env-json", f'{{"env_vars": {{"DMIL_DATA": "{store.root}"}}}}', "--",
