@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
@@ -20,9 +20,9 @@ from services.storage.remote import Storage, given_storage
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
-IDENTITY, SETTINGS = "mlflow_run.json", "config.json"
+IDENTITY, SPOOL, SETTINGS = "mlflow_run.json", "tracking.jsonl", "config.json"
 RECORDS = (
-    IDENTITY, "tracking.jsonl", SETTINGS, "metrics.json", "adaptations.jsonl", "episodes.jsonl", "summary.json",
+    IDENTITY, SPOOL, SETTINGS, "metrics.json", "adaptations.jsonl", "episodes.jsonl", "summary.json",
 )  # fmt: skip
 """What else a run needs to go on, and to be looked at. The first says how far MLflow has taken the second: it is read
 before it and written after it, so that the copy never says that more was taken than it holds."""
@@ -84,7 +84,7 @@ class Replica:
         return self._storage.get(f"{self._name}/{name}", most)
 
     def copy(self) -> None:
-        """Bring the copy up to date: checkpoints, then the records of what came after.
+        """Bring the copy up to date: what the checkpoints' iterations measured, these, then what came after.
 
         What the storage raises, whatever it is, passes through; the next call goes on.
 
@@ -92,9 +92,14 @@ class Replica:
             UserError: if another run has the name there.
         """
         self.claim()
-        self._copy_checkpoints()
+        checkpoints = [path.name for path in self._checkpoints.all()]
+        self._copy_records([SPOOL])  # a copied checkpoint is gone on from, and its iterations not done again
+        self._copy_checkpoints(checkpoints)
+        self._copy_records(RECORDS)
+
+    def _copy_records(self, names: Sequence[str]) -> None:
         changed = {}
-        for name in RECORDS:
+        for name in names:
             path = self._folder / name
             if path.is_file() and self._copied.get(name) != (state := _state(path)):
                 changed[name] = state, read_file(self._folder, name, MOST_RECORDS)
@@ -103,10 +108,9 @@ class Replica:
             self._storage.put(f"{self._name}/{name}", content)
             self._copied[name] = state
 
-    def _copy_checkpoints(self) -> None:
+    def _copy_checkpoints(self, here: Sequence[str]) -> None:
         place = f"{self._name}/checkpoints"
         there = self._storage.committed(place, MARKER, NAMED)
-        here = [path.name for path in self._checkpoints.all()]
         for name in here:
             own = f"checkpoints/{name}"
             try:
