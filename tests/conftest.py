@@ -55,7 +55,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     Before all others go those that share a Ray cluster, which then ends.
     """
-    on_ray = {item.path for item in items if "cluster" in getattr(item, "fixturenames", ())}
+    on_ray = {item.path for item in items if {"cluster", "joined"} & set(getattr(item, "fixturenames", ()))}
 
     def place(item: pytest.Item) -> tuple[bool, int]:
         name = item.path.name

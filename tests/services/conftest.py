@@ -37,6 +37,8 @@ from services.suites import metaworld_speed
 from tests.services.pages import browser, open_page  # noqa: F401  fixtures
 
 PROJECT = Path(__file__).parents[2]
+ON_RAY = {"cluster", "joined"}
+"""Fixtures of the session's Ray cluster."""
 QUICK_EVALUATION = ("--evaluation.shots", "1", "--evaluation.episodes", "1", "--evaluation.fine-tuning-steps", "1")
 
 
@@ -179,7 +181,8 @@ class Cluster(NamedTuple):
     """A Ray cluster on loopback, started from the project's root as a user would."""
 
     address: str
-    dashboard: str
+    dashboard: str | None
+    """Its address, which takes jobs; its ten processes take as long to start as all others."""
     head: int
     """The process that started it."""
 
@@ -192,41 +195,43 @@ class Head:
         self._process: subprocess.Popen[bytes] | None = None
         self._cluster: Cluster | None = None
 
-    def cluster(self) -> Cluster:
-        """Start it, unless it runs."""
-        if self._cluster is None:
+    def cluster(self, *, dashboard: bool) -> Cluster:
+        """Start it, unless it runs, with a dashboard where one is wanted."""
+        if self._cluster is None or (dashboard and self._cluster.dashboard is None):
+            self.stop()
             self._folder = tempfile.mkdtemp(prefix="dmil")  # Ray's sockets lie in it: over 107 bytes are too long
-            self._process, self._cluster = self._start()
+            self._process, self._cluster = self._start(dashboard)
             for _ in range(2):  # somebody else was faster to take one of its ports, or is so busy that Ray gives up
                 if self._process.poll() is not None:
-                    self._process, self._cluster = self._start()
+                    self._process, self._cluster = self._start(dashboard)
             assert self._process.poll() is None, self._log.read_text()
         return self._cluster
 
-    def _start(self) -> tuple[subprocess.Popen[bytes], Cluster]:
+    def _start(self, dashboard: bool) -> tuple[subprocess.Popen[bytes], Cluster]:
         """Start Ray, and wait until it answers or has ended."""
         port, dashboard_port = free_port(), free_port()
         command = [
             sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block", "--num-cpus=3",
             "--node-ip-address=127.0.0.1", f"--port={port}", "--dashboard-host=127.0.0.1",
-            f"--dashboard-port={dashboard_port}", "--include-dashboard=true", f"--temp-dir={self._folder}",
+            f"--dashboard-port={dashboard_port}", f"--include-dashboard={dashboard}", f"--temp-dir={self._folder}",
             f"--dashboard-agent-listen-port={free_port()}",  # another cluster may hold the usual one
-            "--object-store-memory=200000000", "--disable-usage-stats",
+            "--object-store-memory=200000000", "--disable-usage-stats", "--include-log-monitor=false",
         ]  # fmt: skip
         unbuffered = os.environ | {"PYTHONUNBUFFERED": "1"}
         with self._log.open("w") as output:
             head = subprocess.Popen(command, cwd=PROJECT, stdout=output, stderr=output, env=unbuffered)
-        cluster = Cluster(f"127.0.0.1:{port}", f"http://127.0.0.1:{dashboard_port}", head.pid)
+        url = f"http://127.0.0.1:{dashboard_port}" if dashboard else None
+        cluster = Cluster(f"127.0.0.1:{port}", url, head.pid)
 
         def is_up() -> bool:
             """Tell also whether its node is: the dashboard is there before."""
-            return "Ray runtime started" in self._log.read_text() and answers(f"{cluster.dashboard}/api/version")
+            return "Ray runtime started" in self._log.read_text() and (url is None or answers(f"{url}/api/version"))
 
         wait_for(lambda: is_up() or head.poll() is not None, "ray start")
         return head, cluster
 
     def stop(self) -> None:
-        """End it, if it runs: its eleven processes are never quite idle."""
+        """End it, if it runs: its processes are never quite idle."""
         if self._process is not None:
             self._process.send_signal(signal.SIGTERM)
             self._process.wait()
@@ -243,21 +248,22 @@ def head(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Head]:
 
 @pytest.fixture
 def cluster(head: Head) -> Cluster:
-    """The session's Ray cluster."""
-    return head.cluster()
+    """The session's Ray cluster, with a dashboard that takes jobs."""
+    return head.cluster(dashboard=True)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _no_idle_cluster(request: pytest.FixtureRequest, head: Head) -> None:
     """The files whose tests want a cluster come first: it ends at the first other one."""
     items = (item for item in request.session.items if item.path == request.path)
-    if not any("cluster" in getattr(item, "fixturenames", ()) for item in items):
+    if ON_RAY.isdisjoint(name for item in items for name in getattr(item, "fixturenames", ())):
         head.stop()
 
 
 @pytest.fixture
-def joined(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> Cluster:
+def joined(head: Head, monkeypatch: pytest.MonkeyPatch) -> Cluster:
     """Ray runners of this test join the session's cluster."""
+    cluster = head.cluster(dashboard=False)
     monkeypatch.setenv("RAY_ADDRESS", cluster.address)
     return cluster
 
