@@ -4,6 +4,7 @@
 """
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from mlflow import MlflowClient
 from mlflow.entities import Run
 
 from services import tune_sweep
+from services.storage.checkpoints import Checkpoints
+from services.storage.remote import STORAGE
 from services.sweeps.folders import SweepFolder
 from services.sweeps.table_formats import write_tables
 from services.tune_sweep import CONFIGS
@@ -101,17 +104,34 @@ def test_a_sweep_ends_with_its_table(sweep, mlflow_file: str) -> None:
 
 
 @pytest.mark.thorough
-def test_one_training_has_a_row_for_each_evaluation_and_counts_its_practice(sweep) -> None:
+def test_one_training_has_a_row_for_each_evaluation_and_is_fetched_elsewhere(
+    sweep, workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its practice is counted, also where it was fetched."""
+    monkeypatch.setenv(STORAGE, (tmp_path / "storage").as_uri())
     settings = {
         "what": "a test", "suites": ["ml10"], "seeds": [0], "variants": {"one": {"method": {"name": "option-gail"}}},
         "evaluations": {"1": {"fine_tuning_steps": 1}, "2": {"fine_tuning_steps": 2}}, "shots": [1],
         "settings": {"training": {"iterations": 3, "checkpoint_every": 3}, "evaluation": {"episodes": 1}},
     }  # fmt: skip
     Path("own.yaml").write_text(yaml.safe_dump(settings))
-    tables, _, (child,) = sweep("own.yaml")
-    assert list(dict.fromkeys(cell["row"] for cell in tables["cells"])) == ["1", "2"]
-    assert all(cell["environment_steps"] for cell in tables["cells"])
-    assert {f"{row}/success_rate/meta-testing/1-shot" for row in "12"} <= child.data.metrics.keys()
+
+    def trained() -> tuple[str, bytes, str]:
+        tables, _, (child,) = sweep("own.yaml")
+        assert list(dict.fromkeys(cell["row"] for cell in tables["cells"])) == ["1", "2"]
+        assert all(cell["environment_steps"] for cell in tables["cells"])
+        assert {f"{row}/success_rate/meta-testing/1-shot" for row in "12"} <= child.data.metrics.keys()
+        (home,), (log,) = workplace.glob("runs/trained/*"), workplace.glob("runs/run/trials/*/log.txt")
+        newest = Checkpoints(home / "checkpoints", 1).newest()
+        return newest.digest, (home / "metrics.json").read_bytes(), log.read_text()
+
+    digest, curves, log = trained()
+    assert "trained already" not in log
+    shutil.rmtree(workplace / "runs")
+    again = trained()
+    assert again[:2] == (digest, curves)
+    assert f"fetched from {(tmp_path / 'storage').as_uri()}" in again[2]
+    assert "trained already" in again[2]
 
 
 @pytest.mark.thorough

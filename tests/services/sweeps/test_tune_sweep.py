@@ -1,7 +1,6 @@
 """Sweeps as a user runs them: real Tune, real MLflow, real deaths."""
 
 import json
-import shutil
 import signal
 from collections.abc import Iterable
 from pathlib import Path
@@ -20,7 +19,6 @@ from services.demonstrations.store import TaskDemonstrations, open_store
 from services.distributed.ray_runner import open_runner
 from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoints
-from services.storage.remote import STORAGE
 from services.sweeps.folders import SweepFolder
 from services.tracking.tracker import Tracker
 
@@ -82,28 +80,6 @@ def test_a_killed_sweep_goes_on_where_it_was(
     assert {child.info.status for child in children} == {"FINISHED"}
     (child,) = (child for child in children if child.info.run_name == name)
     assert steps_of(mlflow_file, child, "gradient_norm") == list(range(1, 21))
-
-
-@pytest.mark.thorough
-@pytest.mark.usefixtures("joined")
-def test_what_a_sweep_trained_is_fetched_elsewhere(programs, workplace: Path, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setenv(STORAGE, (tmp_path / "storage").as_uri())
-    training = {"iterations": 2, "checkpoint_every": 1}
-    file = write_sweep({"DMIL": {}}, settings={"training": training, "evaluation": EVALUATION})
-
-    def trained() -> tuple[str, bytes, str]:
-        code, printed = programs("tune_sweep", file, "--preset", "smoke", "--name", "once")
-        assert code == 0, printed
-        (home,), (log,) = workplace.glob("runs/trained/*"), workplace.glob("runs/once/trials/*/log.txt")
-        return newest(home).digest, (home / "metrics.json").read_bytes(), log.read_text()
-
-    digest, curves, log = trained()
-    assert "trained already" not in log
-    shutil.rmtree(workplace / "runs")
-    again = trained()
-    assert again[:2] == (digest, curves)
-    assert f"fetched from {(tmp_path / 'storage').as_uri()}" in again[2]
-    assert "trained already" in again[2]
 
 
 def newest(home: Path) -> Checkpoint:
