@@ -41,6 +41,7 @@ Name = str | PurePath
 """A path below a folder, without ``..``."""
 
 _AT_WORK: list[Path] = []
+"""The folders of `at_work_in`, one as often as it is held."""
 
 
 class DiskFullError(RunError):
@@ -325,9 +326,10 @@ def remove_file(root: Path, name: Name) -> None:
 
 
 def copy_plain(root: Path, name: Name, target: Path) -> list[Path]:
-    """Copy a file, or the regular files of a folder, into the folder `target`, and return what of it was left out.
+    """Copy a file, or the regular files of a folder, into the folder `target`.
 
-    Links in the folder are, and the like.
+    Returns:
+        What of the folder was left out: links, pipes and the like.
 
     Raises:
         ForeignFileError: for a link on the way, and for what is neither file nor folder.

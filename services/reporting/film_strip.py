@@ -1,6 +1,7 @@
 """One episode of a new task as a strip of pictures: what the camera saw, and which sub-skill acted."""
 
 import math
+from collections.abc import Sequence
 
 from dmil_core.errors import UserError
 from services.evaluation.results import EpisodeResult
@@ -20,9 +21,9 @@ BORDER = 3.0
 
 
 def strip_of_run(finished: FinishedRun) -> Section:
-    """Return the section with a strip of the episode that `telling` chooses; it is run again for that."""
+    """Return the section with a strip of `example_episode`, which is run again for that."""
     title = "A new task, step by step"
-    if (row := telling(finished)) is None:
+    if (row := example_episode(finished.episodes)) is None:
         return Section(title, [])
     try:
         settings = VideoSettings(camera_of(finished), math.ceil(row.steps / (PICTURES - 1)), HEIGHT, WIDTH)
@@ -34,12 +35,12 @@ def strip_of_run(finished: FinishedRun) -> Section:
     return Section(title, [draw_strip(side_of(finished, one)), Commands("The whole episode", [command(finished, row)])])
 
 
-def telling(finished: FinishedRun) -> EpisodeResult | None:
+def example_episode(episodes: Sequence[EpisodeResult]) -> EpisodeResult | None:
     """Return the first episode of meta-testing that was solved with the fewest shots, or the first one if none was.
 
     None if no adapted policy acted in one.
     """
-    acted = [row for row in finished.episodes if row.split == "meta-testing" and row.steps]
+    acted = [row for row in episodes if row.split == "meta-testing" and row.steps]
     rows = sorted(acted, key=lambda row: row.shots)
     return next((row for row in rows if row.success), rows[0] if rows else None)
 

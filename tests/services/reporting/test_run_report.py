@@ -7,6 +7,7 @@ import pytest
 from services import report
 from services.evaluation.results import write_rows
 from services.experiments.finished_run import FinishedRun
+from services.reporting.film_strip import example_episode
 from services.reporting.page import Commands, DataTable, Prose, Section
 from services.reporting.provenance import episodes_of_run, origin_of_run
 from services.reporting.run_report import AT_THE_END, write_run_page
@@ -159,3 +160,18 @@ def test_what_is_no_finished_run_is_reported_in_words(finished: FinishedRun, tmp
     message = complaint(report.run, "run", "damaged")
     assert "summary.json: got" in message
     assert "wanted what a run writes at its end" in message
+
+
+def test_the_strip_is_of_the_solved_episode_with_the_fewest_shots(finished: FinishedRun):
+    row = next(row for row in finished.episodes if row.split == "meta-testing")
+
+    def example(*changes: dict[str, object]) -> int | None:
+        rows = [row.model_copy(update={"episode": number, "steps": 9, **of}) for number, of in enumerate(changes)]
+        found = example_episode(rows)
+        return None if found is None else found.episode
+
+    few, many, solved = {"shots": 1, "success": False}, {"shots": 3, "success": True}, {"shots": 1, "success": True}
+    assert example(many, few, solved) == 2
+    assert example(few, many) == 1, "solved comes before few shots"
+    assert example({**many, "success": False}, few) == 1
+    assert example({**few, "split": "meta-training"}, {**few, "steps": 0}) is None
