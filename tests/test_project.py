@@ -159,7 +159,7 @@ FREE = {"dmil_core/files.py", "services/local_cluster.py"}
 """The one way into a folder, and what has folders of its own."""
 BY_HAND = {
     "services/cli/streams.py": {"open", "os.open"},  # the null device
-    "services/distributed/node_info.py": {"Path('/sys/fs/cgroup/cpu.max').read_text"},  # the kernel's
+    "services/distributed/node_info.py": {"(CONTROL_GROUP / name).read_text"},  # the kernel's
     "services/demonstrations/npz.py": {"archive.open"},  # a member of an archive in memory
     "services/evaluation/paper_results.py": {"(files('services.evaluation') / 'paper_results.json').read_text"},
     "services/doctor.py": {"folder.rmdir"},  # one that it made, if it is empty

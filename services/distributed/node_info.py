@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from importlib.metadata import distributions
 from pathlib import Path
@@ -17,6 +18,9 @@ import psutil
 from services.storage.provenance import library_versions
 
 SECONDS_TO_ANSWER = 60.0
+CONTROL_GROUP = Path("/sys/fs/cgroup")
+CPU_LIMITS = (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us"))
+"""Files with the microseconds of processor time that a control group grants in so many, in its versions 2 and 1."""
 
 
 class NodeFacts(NamedTuple):
@@ -50,11 +54,12 @@ class NodeFacts(NamedTuple):
 def usable_cpus() -> int:
     """Return how many CPUs this process may use: of its affinity, and of the time that its control group grants."""
     cpus = len(os.sched_getaffinity(0))
-    try:
-        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
-        return max(1, min(cpus, round(int(quota) / int(period))))
-    except (OSError, ValueError):  # there is no limit, or no such file
-        return cpus
+    for names in CPU_LIMITS:
+        with suppress(OSError, ValueError):  # no such file, or no limit
+            quota, period = " ".join((CONTROL_GROUP / name).read_text() for name in names).split()
+            if int(quota) > 0:
+                return max(1, min(cpus, round(int(quota) / int(period))))
+    return cpus
 
 
 def facts(runs: str, mark: str, cpus: float | None = None) -> NodeFacts:

@@ -127,6 +127,25 @@ def test_cpus_are_those_that_the_process_may_use():
     assert 1 <= usable_cpus() <= len(os.sched_getaffinity(0))
 
 
+def test_cpus_are_those_that_the_control_group_grants():
+    """Half a CPU is one, in a group of the kernel's own, which the process sees as a container sees its own."""
+    group = Path("/sys/fs/cgroup/cpu") / f"test-{os.getpid()}"
+    program = "from services.distributed.node_info import usable_cpus; print(usable_cpus())"
+    own = "umount /sys/fs/cgroup/cpu && mount -t cgroup -o cpu none /sys/fs/cgroup/cpu"
+    inside = f'{own} && exec {sys.executable} -c "{program}"'
+    try:
+        group.mkdir()
+        (group / "cpu.cfs_quota_us").write_text("50000")
+    except OSError as error:
+        pytest.skip(f"no control group of version 1 can be made here: {error}")
+    try:
+        enter = f"echo $$ > {group}/cgroup.procs && exec unshare --cgroup --mount sh -c '{inside}'"
+        found = subprocess.run(["sh", "-c", enter], capture_output=True, text=True)
+        assert found.stdout.strip() == "1", found.stderr
+    finally:
+        group.rmdir()
+
+
 def test_a_run_uses_no_more_cpus_than_it_may(monkeypatch):
     import ray
 
