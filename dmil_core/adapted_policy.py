@@ -18,12 +18,11 @@ from dmil_core.checksums import listing, sha256
 from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.errors import RunError, UserError, shorten
 from dmil_core.files import create_file, making_folder, room_for
-from dmil_core.fine_tuning import FineTuning, Optimiser
 from dmil_core.methods.base import Policy
 from dmil_core.methods.registry import method_type
 from dmil_core.policy_tensors import tensors_of, with_tensors
 from dmil_core.recorded import Interface, numbers
-from dmil_core.settings import AnyCount, Positive
+from dmil_core.settings import AnyCount, FineTuning, Optimiser, Positive
 
 POLICY, SEAL = "policy.json", "policy.sha256"
 TENSORS, DEMONSTRATIONS = "policy.safetensors", "demonstrations.safetensors"

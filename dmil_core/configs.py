@@ -6,17 +6,18 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, SerializeAsAny, model_validator
 
-from dmil_core.fine_tuning import FineTuning, Optimiser
+from dmil_core.methods.configs import config_type
 from dmil_core.methods.dmil.config import DmilConfig
-from dmil_core.methods.registry import config_type
 from dmil_core.points import Points
 from dmil_core.settings import (
     AnyCount,
     ContextConfig,
     Count,
+    FineTuning,
     Flag,
     MethodConfig,
     NotNegative,
+    Optimiser,
     Positive,
     Seed,
     Settings,

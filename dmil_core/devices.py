@@ -8,7 +8,7 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from pydantic import Field
@@ -18,10 +18,10 @@ from dmil_core.errors import RunError, UserError, shorten
 from dmil_core.methods.base import FineTuning, MetaLearner, Method, Policy
 from dmil_core.networks import Parameters
 from dmil_core.policy_tensors import tensors_of, with_tensors
+from dmil_core.settings import GradientPath
 
 NAMES = r"auto|cpu|cuda(:[0-9]{1,4})?"
 DeviceName = Annotated[str, Field(pattern=f"^({NAMES})$")]
-GradientPath = Literal["auto", "loop", "batched"]
 CPU = torch.device("cpu")
 WORKSPACE = "CUBLAS_WORKSPACE_CONFIG"
 """Without it cuBLAS may add in another order each time; it counts from a process's first product on a GPU on."""

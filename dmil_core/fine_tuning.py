@@ -1,7 +1,6 @@
 """Fine-tuning by Adam on batches of states, its rate falling along a cosine: many steps on many displaced copies."""
 
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple, TypeAlias
 
 import torch
 from jaxtyping import Float, Int
@@ -9,21 +8,10 @@ from torch import Tensor
 
 from dmil_core.losses import Steps, squared_errors
 from dmil_core.networks import Adam, Layer, Network, cosine_rate, descend
+from dmil_core.settings import FineTuning
 
 BATCH = 128
 """States in a step."""
-Optimiser: TypeAlias = Literal["sgd", "adam"]
-
-
-class FineTuning(NamedTuple):
-    """Gradient steps of adaptation at test; a method without any ignores it."""
-
-    steps: int
-    learning_rate: float
-    optimiser: Optimiser = "sgd"
-    """sgd: plain steps on the whole support set, as in the inner loop; adam: `on_batches`."""
-    displaced: int = 0
-    """Displaced copies of the support set, see `dmil_core.paths.with_copies`."""
 
 
 def on_batches(networks: Sequence[Network], loss: Callable[[Steps], Tensor], steps: Steps, tuning: FineTuning) -> None:

@@ -1,7 +1,7 @@
-"""Bounds of settings, and the bases of a method's own settings."""
+"""Bounds of settings, and the bases of a method's own settings; without torch, as all that `--help` shows."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic_core import PydanticCustomError
@@ -17,6 +17,11 @@ Seed = Annotated[int, Field(ge=0, lt=2**63, strict=True)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
 Probability = Annotated[float, Field(ge=0, lt=1, strict=True)]
+Optimiser: TypeAlias = Literal["sgd", "adam"]
+GradientPath: TypeAlias = Literal["auto", "loop", "batched"]
+"""How a group's gradients are computed, see `dmil_core.devices.Compute`."""
+OnNonfinite: TypeAlias = Literal["stop", "skip"]
+"""What becomes of an iteration whose loss or gradient is not finite."""
 
 
 T = TypeVar("T")
@@ -37,6 +42,17 @@ class Settings(BaseModel):
     """Base of all settings: unknown keys are refused, and instances are immutable."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class FineTuning(NamedTuple):
+    """Gradient steps of adaptation at test; a method without any ignores it."""
+
+    steps: int
+    learning_rate: float
+    optimiser: Optimiser = "sgd"
+    """sgd: plain steps on the whole support set, as in the inner loop; adam: `dmil_core.fine_tuning.on_batches`."""
+    displaced: int = 0
+    """Displaced copies of the support set, see `dmil_core.paths.with_copies`."""
 
 
 class MethodConfig(Settings):

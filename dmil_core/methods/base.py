@@ -23,11 +23,11 @@ from torch import Tensor
 from dmil_core.demonstrations import Demonstration, Normalisation
 from dmil_core.errors import UserError
 from dmil_core.features import RelativeFeatures
-from dmil_core.fine_tuning import FineTuning as FineTuning
 from dmil_core.losses import Steps
 from dmil_core.networks import Parameters
 from dmil_core.paths import with_copies
 from dmil_core.points import Points
+from dmil_core.settings import FineTuning as FineTuning
 from dmil_core.settings import MethodConfig
 from dmil_core.trajectories import Rollout
 

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dmil_core.errors import UserError, describe_errors
 from dmil_core.files import read_file, write_file
-from dmil_core.fine_tuning import Optimiser
+from dmil_core.settings import Optimiser
 from services.suites.base import Split
 
 Row = TypeVar("Row", bound=BaseModel)

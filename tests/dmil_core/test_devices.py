@@ -12,10 +12,11 @@ import torch
 from dmil_core.devices import CPU, Compute, computing_on, describe, device_of
 from dmil_core.errors import RunError, UserError
 from dmil_core.methods.behaviour_cloning.method import BehaviourCloning
+from dmil_core.methods.configs import method_names
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.dmil.method import Dmil
 from dmil_core.methods.mil.method import Mil
-from dmil_core.methods.registry import method_names, method_type
+from dmil_core.methods.registry import method_type
 from dmil_core.outer_loop import group_gradient
 from dmil_core.seeding import named_rng
 from tests.dmil_core.carrying import POINTS, demonstrate

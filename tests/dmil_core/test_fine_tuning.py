@@ -6,13 +6,14 @@ import pytest
 import torch
 
 from dmil_core.configs import TrainingConfig
-from dmil_core.fine_tuning import BATCH, FineTuning, fixed, free, mean_error, on_batches
+from dmil_core.fine_tuning import BATCH, fixed, free, mean_error, on_batches
 from dmil_core.losses import Steps
 from dmil_core.methods.dmil.adaptation import Hierarchy, adapt_by_adam
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.networks import initialise, mlp, network
 from dmil_core.outer_loop import OuterState, OuterStep
 from dmil_core.seeding import named_rng
+from dmil_core.settings import FineTuning
 
 
 def steps_of(count: int) -> Steps:

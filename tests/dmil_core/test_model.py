@@ -13,7 +13,7 @@ import torch
 
 import dmil_core as dmil
 from dmil_core.checkpoint import Range
-from dmil_core.fine_tuning import FineTuning
+from dmil_core.settings import FineTuning
 from tests.dmil_core.old_models import FOLDER, METHODS, old_model, recorded
 
 

@@ -8,12 +8,12 @@ from jaxtyping import Float32, Int64
 from torch import Tensor
 
 from dmil_core.demonstrations import Normalisation
-from dmil_core.fine_tuning import FineTuning, fixed, free, mean_error, on_batches
+from dmil_core.fine_tuning import fixed, free, mean_error, on_batches
 from dmil_core.losses import Steps
 from dmil_core.methods.base import Decision, NormalisedPolicy
 from dmil_core.methods.path_context import PathGuide
 from dmil_core.networks import Network, Parameters, descend, initialise, mlp
-from dmil_core.settings import NetworkConfig
+from dmil_core.settings import FineTuning, NetworkConfig
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from dmil_core.fine_tuning import FineTuning, fixed, free, mean_error, on_batches
+from dmil_core.fine_tuning import fixed, free, mean_error, on_batches
 from dmil_core.loss_gradients import LossGradient, loss_gradient
 from dmil_core.losses import Steps, bank_errors, behaviour_cloning_loss, squared_errors, sub_skill_labels
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.dmil.losses import Targets, hard_labels, high_level_loss, targets_of
 from dmil_core.networks import Network, Parameters, bank, mlp, network, own_states, routed, stacked, without_graph
+from dmil_core.settings import FineTuning
 
 
 class Hierarchy(NamedTuple):

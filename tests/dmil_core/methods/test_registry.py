@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from dmil_core.errors import UserError
+from dmil_core.methods.configs import config_type, method_names
 from dmil_core.methods.mil.config import MilConfig
 from dmil_core.methods.nearest_neighbour.config import NearestNeighbourConfig
-from dmil_core.methods.registry import OURS, config_type, method_names, method_type
+from dmil_core.methods.registry import OURS, method_type
 
 NEAREST = "from dmil_core.methods.nearest_neighbour.method import NearestNeighbour as Nearest"
 
@@ -91,7 +92,7 @@ def test_a_package_s_method_does_not_pass_for_one_of_ours(install, asked: str) -
     with pytest.raises(UserError) as caught:
         method_type(asked)
     assert str(caught.value) == (
-        "entry points dmil.methods: got mil twice, our own dmil_core.methods.mil.method:Mil and one_package:Nearest of "
+        "entry points dmil.methods: got mil twice, a method of our own and one_package:Nearest of "
         "the package one_package; wanted another name than any of ours; rename the package's, or uninstall it"
     )
     assert config_type("mil") is MilConfig

@@ -11,6 +11,7 @@ import torch
 
 from dmil_core.devices import Compute, GradientPath
 from dmil_core.outer_loop import add, groups
+from dmil_core.settings import GradientPath
 from services.demonstrations.store import DemoStore
 from services.distributed.adaptation_worker import AdaptationWorker, Block
 from services.distributed.chunking import CHUNK_LENGTH, from_chunks, to_chunks
