@@ -12,15 +12,13 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
 
-from dmil_core.adapted_policy import AdaptedPolicy
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import UserError
-from dmil_core.model import DivergedError, Model, UnlikeTrainingWarning, load
 from dmil_core.seeding import named_seed
 from dmil_core.settings import sub_skills_of
 from dmil_core.statistics import interval_text, success_rate
@@ -28,10 +26,12 @@ from services.cli.arguments import exit_code, parse
 from services.cli.composition import suite_settings
 from services.cli.progress import Bar, console
 from services.demonstrations.external import places_of, read_episodes
-from services.rollouts.adaptations import imitation_error
-from services.rollouts.episodes import rollout
 from services.suites.base import TaskSuite, build_env
 from services.suites.registry import open_suite
+
+if TYPE_CHECKING:
+    from dmil_core.adapted_policy import AdaptedPolicy
+    from dmil_core.model import Model
 
 FACTORS = (0, 0.5, 1, 2, 4)
 """Numbers of steps to choose from, as multiples of the model's own."""
@@ -75,6 +75,9 @@ def run(arguments: Sequence[str]) -> None:
         raise UserError("--suite: got --suite or --task alone; wanted both: --suite ml45 --task door-lock")
     if args.episodes < 1:
         raise UserError(f"--episodes: got {args.episodes}; wanted at least 1")
+    from dmil_core.model import UnlikeTrainingWarning, load
+    from services.rollouts.adaptations import imitation_error
+
     suite = None if args.suite is None else open_suite(suite_settings(args.suite, (str(args.task),)))
     model = load(args.model, args.runs, args.device)
     recorded = _recorded(args.demos, suite)
@@ -105,7 +108,7 @@ def _recorded(source: str, suite: TaskSuite | None) -> list[tuple[np.ndarray, np
     return [(state_of(episode.observations), episode.actions) for episode in read_episodes(places[0])]
 
 
-def _chosen_steps(model: Model, support: Sequence[Demonstration], args: Arguments) -> int:
+def _chosen_steps(model: "Model", support: Sequence[Demonstration], args: Arguments) -> int:
     """Return the number of steps with the least mean error on the demonstrations left out, and print all errors."""
     usual = model.fine_tuning.steps
     candidates = sorted({round(usual * factor) for factor in FACTORS}) if args.steps is None else [args.steps]
@@ -129,16 +132,19 @@ def _chosen_steps(model: Model, support: Sequence[Demonstration], args: Argument
 
 
 def _error(
-    model: Model, support: Sequence[Demonstration], left_out: Demonstration, steps: int, rate: float | None
+    model: "Model", support: Sequence[Demonstration], left_out: Demonstration, steps: int, rate: float | None
 ) -> float:
     """Return the error on a demonstration that was not adapted to; infinite where adaptation diverges."""
+    from dmil_core.model import DivergedError
+    from services.rollouts.adaptations import imitation_error
+
     try:
         return imitation_error(model.adapt(support, steps=steps, learning_rate=rate).policy, [left_out])
     except DivergedError:
         return float("inf")
 
 
-def _show_sub_skills(policy: AdaptedPolicy, support: Sequence[Demonstration]) -> None:
+def _show_sub_skills(policy: "AdaptedPolicy", support: Sequence[Demonstration]) -> None:
     count = sub_skills_of(policy.origin.model.config.method)
     if count > 1:
         chosen = np.concatenate([policy.policy.sub_skill_use(one).chosen for one in support])
@@ -147,8 +153,10 @@ def _show_sub_skills(policy: AdaptedPolicy, support: Sequence[Demonstration]) ->
         console.print(f"sub-skills in use: {np.count_nonzero(shares)} of {count}, with {shown} of the steps")
 
 
-def _measure(policy: AdaptedPolicy, suite: TaskSuite, task: str, episodes: int, seed: int) -> None:
+def _measure(policy: "AdaptedPolicy", suite: TaskSuite, task: str, episodes: int, seed: int) -> None:
     """Let the policy act in so many episodes, the first ones of an evaluation, and print how many are successes."""
+    from services.rollouts.episodes import rollout
+
     seeds = [named_seed(seed, "evaluation", task, episode) for episode in range(episodes)]
     rollouts = []
     with Bar("acting", episodes) as bar:
@@ -165,7 +173,7 @@ def _measure(policy: AdaptedPolicy, suite: TaskSuite, task: str, episodes: int, 
     )
 
 
-def _guide(folder: Path, policy: AdaptedPolicy) -> str:
+def _guide(folder: Path, policy: "AdaptedPolicy") -> str:
     interface = policy.origin.interface
     return (
         f"policy: {folder} ({policy.nbytes / 1e6:.1f} MB; {policy.origin.fine_tuning.steps} steps at "

@@ -26,8 +26,7 @@ from services.cli.composition import DEFAULT_PRESET, EARLY, defaults_from
 from services.cli.places import announce
 from services.cli.progress import Clock, console
 from services.demonstrations.store import DATA, TaskDemonstrations, open_store
-from services.distributed.ray_runner import RunnerKind, open_runner
-from services.experiments.experiment import Experiment
+from services.distributed.cluster import RunnerKind
 
 
 class Collection(Settings):
@@ -68,6 +67,9 @@ def run(arguments: Sequence[str]) -> None:
     config = defaults_from(peek(arguments, **EARLY))
     defaults = Collection(suite=config.suite, demonstrations=config.demonstrations)
     args = parse(Arguments, __doc__ or "", arguments, Arguments(defaults))
+    from services.distributed.ray_runner import open_runner
+    from services.experiments.experiment import Experiment
+
     store = open_store()
     announce(demonstrations=(store.root, f"{DATA}=FOLDER"))
     experiment = Experiment(config.model_copy(update=dict(args.collection)), store)

@@ -14,34 +14,30 @@ from dataclasses import dataclass
 from datetime import datetime
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from dmil_core.checkpoint import FOLDER, Checkpoint, opened
 from dmil_core.configs import EvaluationConfig, ExperimentConfig
-from dmil_core.devices import Compute
 from dmil_core.errors import RunError, UserError
 from dmil_core.files import at_home, remove_folder, write_file
-from dmil_core.methods.registry import method_type
-from dmil_core.model import model_folder
 from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import checked, with_evaluation
 from services.cli.places import announce
 from services.cli.progress import Clock, console
 from services.demonstrations.external import places_of
 from services.demonstrations.store import DATA, open_store
-from services.distributed.ray_runner import RunnerKind, check_compute, open_runner
-from services.evaluation.expectation import expected_rows, verdicts
-from services.evaluation.summary import Summary
-from services.experiments.champions import ALIAS, Promotion, open_promotion
-from services.experiments.experiment import Experiment
-from services.experiments.finished_run import EVALUATED
-from services.reporting.end_of_run import conclude, show
+from services.distributed.cluster import RunnerKind
 from services.storage.folder_lock import held
 from services.storage.run_folders import make_folder
 from services.tracking.links import database, tracking_uri
 from services.tracking.tracker import Tracker, record_settings
+
+if TYPE_CHECKING:
+    from dmil_core.checkpoint import Checkpoint
+    from services.evaluation.summary import Summary
+    from services.experiments.champions import Promotion
+    from services.experiments.experiment import Experiment
 
 logger = logging.getLogger(__name__)
 
@@ -97,6 +93,9 @@ def run(arguments: Sequence[str]) -> None:
     early = peek(arguments, checkpoint=str, demos=str, runs=Path)
     evaluation, checkpoint = EvaluationConfig(), None
     if early.checkpoint is not None:
+        from dmil_core.checkpoint import opened
+        from dmil_core.model import model_folder
+
         folder = model_folder(early.checkpoint, early.runs or Arguments.runs, "--checkpoint")
         checkpoint = opened(folder, logger.warning)
         evaluation = checkpoint.manifest.config.evaluation
@@ -104,6 +103,12 @@ def run(arguments: Sequence[str]) -> None:
             evaluation = evaluation.model_copy(update={"controls": ()})
     args = parse(Arguments, __doc__ or "", arguments, Arguments(early.checkpoint or tyro.MISSING, evaluation))
     assert checkpoint is not None, "without --checkpoint there is nothing that parses"
+    from dmil_core.devices import Compute
+    from dmil_core.methods.registry import method_type
+    from services.distributed.ray_runner import check_compute
+    from services.evaluation.expectation import expected_rows, verdicts
+    from services.experiments.experiment import Experiment
+
     tasks = args.tasks if args.tasks is not None or early.demos is None else tuple(places_of(early.demos))
     config = _config(checkpoint, args, tasks, early.demos)
     check_compute(args.runner, Compute(args.device), method_type(config.method.name), args.gpus)
@@ -129,7 +134,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _config(
-    checkpoint: Checkpoint, args: Arguments, tasks: tuple[str, ...] | None, demos: str | None
+    checkpoint: "Checkpoint", args: Arguments, tasks: tuple[str, ...] | None, demos: str | None
 ) -> ExperimentConfig:
     """Return the settings of the evaluation.
 
@@ -152,7 +157,7 @@ def _config(
     return checked(settings | {section: settings[section] | values for section, values in changed.items()})
 
 
-def _new_folder(args: Arguments, checkpoint: Checkpoint) -> Path:
+def _new_folder(args: Arguments, checkpoint: "Checkpoint") -> Path:
     """Return the folder of an evaluation, which is not there yet.
 
     Raises:
@@ -162,6 +167,8 @@ def _new_folder(args: Arguments, checkpoint: Checkpoint) -> Path:
         if args.output.exists():
             raise UserError(f"--output: got {args.output}, which is there already; wanted the name of a new folder")
         return args.output
+    from dmil_core.checkpoint import FOLDER
+
     of_run = checkpoint.path.parent.name == FOLDER
     home, model = (checkpoint.path.parents[1],) * 2 if of_run else (at_home(args.runs), checkpoint.path)
     first = home / EVALUATIONS / f"{model.resolve().name}-{datetime.now():%Y%m%d-%H%M%S}"
@@ -169,8 +176,10 @@ def _new_folder(args: Arguments, checkpoint: Checkpoint) -> Path:
     return next(folder for folder in numbered if not folder.exists())
 
 
-def _promotion(checkpoint: Checkpoint, experiment: Experiment, output: Path) -> Promotion:
+def _promotion(checkpoint: "Checkpoint", experiment: "Experiment", output: Path) -> "Promotion":
     """Open a promotion; where that is refused, the new folder `output` is removed."""
+    from services.experiments.champions import ALIAS, open_promotion
+
     try:
         return open_promotion(checkpoint, experiment, output / ALIAS)
     except (UserError, RunError):
@@ -180,12 +189,17 @@ def _promotion(checkpoint: Checkpoint, experiment: Experiment, output: Path) -> 
 
 def _carry_out(
     args: Arguments,
-    checkpoint: Checkpoint,
-    experiment: Experiment,
+    checkpoint: "Checkpoint",
+    experiment: "Experiment",
     output: Path,
     only: tuple[str, ...] | None,
-    promotion: Promotion | None,
-) -> Summary:
+    promotion: "Promotion | None",
+) -> "Summary":
+    from dmil_core.devices import Compute
+    from services.distributed.ray_runner import open_runner
+    from services.experiments.finished_run import EVALUATED
+    from services.reporting.end_of_run import conclude, show
+
     write_file(output, EVALUATED, experiment.config.model_dump_json(indent=1) + "\n")
     clock, status = Clock(), "FAILED"
     tracker = Tracker(output, f"dmil-{experiment.config.suite.name}")

@@ -11,20 +11,19 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from dmil_core.checkpoint import CONSTANTS, MANIFEST, MARKER, MOST_CONSTANTS, MOST_TENSORS, PARAMETERS, Checkpoint
 from dmil_core.checksums import checked_file, listing, sha256
 from dmil_core.errors import UserError
 from dmil_core.files import create_file, making_folder, read_json
-from dmil_core.model import load
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
-from services.evaluation.expectation import FIGURES, MOST_BYTES
-from services.evaluation.summary import Summary
-from services.reporting.model_card import CARD, model_card
+
+if TYPE_CHECKING:
+    from dmil_core.checkpoint import Checkpoint
+    from services.evaluation.summary import Summary
 
 
 @dataclass(frozen=True)
@@ -50,6 +49,11 @@ def run(arguments: Sequence[str]) -> None:
     args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING, tyro.MISSING))
     if args.folder.exists():
         raise UserError(f"FOLDER: got {args.folder}, which is there already; wanted the name of a new folder")
+    from dmil_core.checkpoint import Checkpoint
+    from dmil_core.model import load
+    from services.evaluation.expectation import FIGURES
+    from services.reporting.model_card import CARD, model_card
+
     checkpoint = load(args.run, args.runs).checkpoint
     summary = _figures(checkpoint, args.figures or checkpoint.path.parents[1])
     files = _files(checkpoint)
@@ -63,8 +67,11 @@ def run(arguments: Sequence[str]) -> None:
     console.print(f"{args.folder}: {size / 1e6:.1f} MB; to evaluate it: dmil evaluate {shlex.quote(str(args.folder))}")
 
 
-def _figures(checkpoint: Checkpoint, folder: Path) -> Summary:
+def _figures(checkpoint: "Checkpoint", folder: Path) -> "Summary":
     """Return the summary of an evaluation without what is only of the machine that it was made on."""
+    from services.evaluation.expectation import FIGURES, MOST_BYTES
+    from services.evaluation.summary import Summary
+
     advice = (
         "wanted the summary of an evaluation of the run's newest checkpoint: dmil evaluate RUN, then --figures FOLDER"
     )
@@ -77,8 +84,10 @@ def _figures(checkpoint: Checkpoint, folder: Path) -> Summary:
     return summary.model_copy(update={"checkpoint": "", "report": "", "mlflow_run_id": None})
 
 
-def _files(checkpoint: Checkpoint) -> dict[str, bytes]:
+def _files(checkpoint: "Checkpoint") -> dict[str, bytes]:
     """Return the files of a checkpoint by name, without the optimiser's."""
+    from dmil_core.checkpoint import CONSTANTS, MANIFEST, MARKER, MOST_CONSTANTS, MOST_TENSORS, PARAMETERS
+
     manifest = checkpoint.manifest
     most = {PARAMETERS: MOST_TENSORS, CONSTANTS: MOST_CONSTANTS}
     files = {name: checked_file(checkpoint.path, name, manifest.files[name], most[name]) for name in most}

@@ -13,33 +13,32 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from pydantic import ValidationError
 
 from dmil_core.configs import DEFAULT_METHOD, ExperimentConfig
-from dmil_core.devices import Compute, GradientPath
 from dmil_core.errors import UserError, describe_errors
 from dmil_core.files import check_folder, read_file, write_file
-from dmil_core.methods.registry import method_type
+from dmil_core.settings import GradientPath, OnNonfinite
 from services.cli.arguments import Quiet, exit_code, parse, peek
 from services.cli.composition import DEFAULT_PRESET, EARLY, defaults_from
 from services.cli.places import announce
 from services.cli.progress import Clock, console
 from services.demonstrations.store import DATA, open_store
-from services.distributed.ray_runner import RunnerKind, check_compute, open_runner
-from services.experiments.experiment import Experiment, OnNonfinite, changed_settings, check_settings
-from services.reporting.end_of_run import conclude, show
-from services.storage.checkpoints import Checkpoints
+from services.distributed.cluster import RunnerKind
 from services.storage.folder_lock import held
 from services.storage.redaction import redacted
 from services.storage.remote import STORAGE
-from services.storage.replication import claim_name, replicated, restored
 from services.storage.run_folders import find_folder, make_folder, new_name, resume_command
 from services.tracking.links import database, tracking_uri
 from services.tracking.system import recording_system
 from services.tracking.tracker import Tracker, record_settings
+
+if TYPE_CHECKING:
+    from dmil_core.devices import Compute
+    from services.experiments.experiment import Experiment
 
 MARK = "config.json"
 """What a run's folder is known by."""
@@ -91,14 +90,21 @@ class Arguments:
     quiet: Quiet = False
 
     @property
-    def compute(self) -> Compute:
+    def compute(self) -> "Compute":
         """What computes."""
+        from dmil_core.devices import Compute
+
         return Compute(self.device, self.path)
 
 
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     args, folder = _read(arguments)
+    from dmil_core.methods.registry import method_type
+    from services.distributed.ray_runner import check_compute
+    from services.experiments.experiment import Experiment
+    from services.storage.replication import claim_name, replicated
+
     check_compute(args.runner, args.compute, method_type(args.experiment.method.name), args.gpus)
     experiment = Experiment(args.experiment, store := open_store())
     announce(
@@ -116,7 +122,12 @@ def run(arguments: Sequence[str]) -> None:
             _carry_out(args, folder, experiment)
 
 
-def _carry_out(args: Arguments, folder: Path, experiment: Experiment) -> None:
+def _carry_out(args: Arguments, folder: Path, experiment: "Experiment") -> None:
+    from services.distributed.ray_runner import open_runner
+    from services.experiments.experiment import check_settings
+    from services.reporting.end_of_run import conclude, show
+    from services.storage.checkpoints import Checkpoints
+
     config = args.experiment
     checkpoints = Checkpoints(folder / "checkpoints", config.training.checkpoints_kept)
     checkpoint = checkpoints.newest() if checkpoints.all() else None
@@ -182,6 +193,8 @@ def _read(arguments: Sequence[str]) -> tuple[Arguments, Path]:
         raise UserError(
             f"--name: got {early.name} with --resume; wanted one of them: a run that goes on keeps its name"
         )
+    from services.storage.replication import restored
+
     runs = early.runs or Arguments.runs
     wanted = Path(early.resume) if Path(early.resume).name != early.resume else runs / early.resume
     if restored(wanted):
@@ -203,6 +216,8 @@ def _same_run(before: ExperimentConfig, now: ExperimentConfig) -> None:
     Raises:
         UserError: names the sections that differ.
     """
+    from services.experiments.experiment import changed_settings
+
     if changed := changed_settings(before, now):
         raise UserError(
             f"--resume: got other settings of {', '.join(changed)} than the run began with; wanted the same, except "

@@ -13,12 +13,12 @@ from services.cli.help_texts import command_of
 from services.cli.progress import console
 
 KINDS = {
-    "run": "services.reporting.run_report",
-    "compare": "services.sweeps.compare",
-    "sub-skills": "services.reporting.sub_skill_report",
-    "video": "services.reporting.video",
-    "gallery": "services.reporting.gallery",
-    "tables": "services.sweeps.table_formats",
+    "run": "services.report_run",
+    "compare": "services.report_compare",
+    "sub-skills": "services.report_sub_skills",
+    "video": "services.report_video",
+    "gallery": "services.report_gallery",
+    "tables": "services.report_tables",
 }
 """What the program draws, and the module that does."""
 

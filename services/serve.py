@@ -17,7 +17,6 @@ import tyro
 
 from dmil_core.errors import RunError, UserError
 from dmil_core.files import read_file
-from dmil_core.model import load
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.distributed.cluster import joined, named_address
@@ -54,6 +53,8 @@ def run(arguments: Sequence[str]) -> None:
     args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
     if args.replicas < 1:
         raise UserError(f"--replicas: got {args.replicas}; wanted at least 1")
+    from dmil_core.model import load
+
     model = load(args.model, args.runs)
     token, place = given_token(), f"{TOKEN} or {TOKEN_PATH}"
     _check_port(args.port)

@@ -22,15 +22,12 @@ from services.cli.progress import Clock, console
 from services.cli.yaml_files import read_yaml
 from services.demonstrations.store import DATA, data_root, open_store
 from services.distributed.cluster import joined
-from services.distributed.ray_runner import open_runner
-from services.experiments.experiment import Experiment
 from services.storage.folder_lock import held
 from services.storage.provenance import git_commit, library_versions
 from services.storage.run_folders import find_folder, new_name, resume_command
 from services.suites.registry import open_suite
 from services.sweeps.folders import MARK, SweepFolder, SweepRecord
 from services.sweeps.settings import Preset, Sweep, planned
-from services.sweeps.table_formats import publish, show, write_tables
 from services.tracking.delivery import Identity
 from services.tracking.links import comparison_link, database, tracking_uri
 from services.tracking.ownership import IDENTITY
@@ -81,6 +78,8 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _carry_out(sweep: SweepFolder) -> None:
+    from services.sweeps.table_formats import publish, show, write_tables
+
     clock = Clock()
     tracker = Tracker(sweep.path, f"dmil-{sweep.record.name}")
     status = "FAILED"
@@ -92,7 +91,7 @@ def _carry_out(sweep: SweepFolder) -> None:
             clock.lap("collect")
             tracker.wait_for_run_id()  # trials are its children
             os.environ |= TUNE_SETTINGS
-            from services.sweeps.tuning import tune_trials  # takes seconds to import: not for --help
+            from services.sweeps.tuning import tune_trials  # Tune reads them when it is imported
 
             tune_trials(sweep)
             clock.lap("trials")
@@ -211,6 +210,9 @@ def _side_by_side(sweep: SweepFolder) -> list[str]:
 
 def _collect(sweep: SweepFolder) -> None:
     """Have all demonstrations there before the first trial, made on all CPUs."""
+    from services.distributed.ray_runner import open_runner
+    from services.experiments.experiment import Experiment
+
     store = open_store()
     configs = {(trial.config.suite, trial.config.demonstrations): trial.config for trial in sweep.trials.values()}
     for config in configs.values():

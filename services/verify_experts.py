@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.table import Table
@@ -12,11 +13,12 @@ from dmil_core.statistics import interval_text, success_rate
 from services.cli.arguments import Quiet, exit_code, parse
 from services.cli.composition import suite_settings
 from services.cli.progress import Bar, console
-from services.distributed.ray_runner import RunnerKind, open_runner
-from services.distributed.work_items import Verification
-from services.rollouts.verification import VerificationRow
+from services.distributed.cluster import RunnerKind
 from services.suites.base import TaskSuite
 from services.suites.registry import open_suite
+
+if TYPE_CHECKING:
+    from services.rollouts.verification import VerificationRow
 
 CHUNK = 5
 """Seeds in one call to a simulation worker."""
@@ -46,6 +48,9 @@ class Arguments:
 def run(arguments: Sequence[str]) -> None:
     """Run the program."""
     args = parse(Arguments, __doc__ or "", arguments, Arguments())
+    from services.distributed.ray_runner import open_runner
+    from services.distributed.work_items import Verification
+
     suite = open_suite(suite_settings(args.suite, args.tasks))
     tasks = args.tasks or getattr(suite, "expert_tasks", (*suite.train_tasks, *suite.test_tasks))
     tasks = [task for task in dict.fromkeys(tasks) if suite.expert(task) is not None]
@@ -70,7 +75,7 @@ def run(arguments: Sequence[str]) -> None:
     console.print(_table(suite, tasks, rows, args))
 
 
-def _table(suite: TaskSuite, tasks: Sequence[str], rows: Sequence[VerificationRow], args: Arguments) -> Table:
+def _table(suite: TaskSuite, tasks: Sequence[str], rows: "Sequence[VerificationRow]", args: Arguments) -> Table:
     seeds = f"seeds {args.first_seed} to {args.first_seed + args.seeds - 1}"
     view = Table(title=f"Experts ({suite.protocol}; noise {args.noise:g}; {seeds})")
     scored = suite.best_score > 1

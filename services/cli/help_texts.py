@@ -15,12 +15,12 @@ COMMANDS = {
     "services.inspect_demos": "services.collect_demos inspect",
     "services.record_demos": "services.collect_demos record",
     "services.verify_experts": "services.collect_demos verify",
-    "services.reporting.run_report": "services.report run",
-    "services.sweeps.compare": "services.report compare",
-    "services.reporting.sub_skill_report": "services.report sub-skills",
-    "services.reporting.video": "services.report video",
-    "services.reporting.gallery": "services.report gallery",
-    "services.sweeps.table_formats": "services.report tables",
+    "services.report_run": "services.report run",
+    "services.report_compare": "services.report compare",
+    "services.report_sub_skills": "services.report sub-skills",
+    "services.report_video": "services.report video",
+    "services.report_gallery": "services.report gallery",
+    "services.report_tables": "services.report tables",
     "services.tracking.__main__": "services.tracking",
 }
 """How modules are called that are no program of their own name."""

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import psutil
 
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+RunnerKind = Literal["ray", "local"]
+"""Where a program works: in Ray actors, or in this process."""
 OBJECT_STORE_BYTES = 500_000_000
 SECONDS_TO_ANSWER = 20.0
 

@@ -5,14 +5,14 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from dmil_core.devices import USUAL, Compute, device_of
 from dmil_core.errors import UserError, WorkError
 from dmil_core.methods.base import Method
 from services.cli.live_view import Workers
 from services.distributed.calls import Call, DeadlyCallError
-from services.distributed.cluster import cpus, joined, named_address
+from services.distributed.cluster import RunnerKind, cpus, joined, named_address
 from services.distributed.gpus import SHARES, cluster_gpus, gpus_of_each
 from services.distributed.metrics import Meter, RayMeter, WorkerCounter
 from services.distributed.ray_meta_training import RayMetaTraining
@@ -29,7 +29,6 @@ NICENESS = 10
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
-RunnerKind = Literal["ray", "local"]
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from dmil_core.methods.registry import method_type
 from dmil_core.networks import Parameters, flatten
 from dmil_core.outer_loop import OuterState
 from dmil_core.seeding import named_rng
+from dmil_core.settings import OnNonfinite
 from services.cli.live_view import Status
 from services.cli.progress import Bar
 from services.demonstrations.collection import DemonstrationCollection
@@ -34,7 +35,6 @@ from services.suites.base import Split, TaskSuite, action_space_of, with_points
 from services.suites.registry import open_suite
 from services.tracking.tracker import Tracker
 
-OnNonfinite = Literal["stop", "skip"]
 MOST_FAULTS = 0.01
 """Of the episodes of an evaluation, those that a simulator may spoil."""
 CHANGEABLE: dict[str, Any] = {"evaluation": True, "training": {"iterations", "checkpoint_every", "checkpoints_kept"}}

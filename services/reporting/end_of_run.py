@@ -30,7 +30,7 @@ def conclude(
         evaluation, seconds=clock.seconds, folder=folder, mlflow_run_id=tracker.run_id, controls=controls
     )
     write_report(summary, folder)
-    from services.reporting.run_report import write_run_page  # takes seconds to import: not for --help
+    from services.reporting.run_report import write_run_page  # takes seconds to import: not before the work
 
     with aside("the page"):
         write_run_page(FinishedRun(folder), inside(folder, REPORT) / PAGE)

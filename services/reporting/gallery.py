@@ -1,7 +1,5 @@
-"""Draw the tasks of every suite, each as its expert solves it: the paper's Figures 6 to 9."""
+"""A picture of a suite: each task as its expert solves it."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 
@@ -9,52 +7,16 @@ import numpy as np
 from jaxtyping import UInt8
 from matplotlib.figure import Figure
 
-from dmil_core.configs import DemonstrationConfig, SuiteConfig
-from dmil_core.errors import UserError
+from dmil_core.configs import DemonstrationConfig
 from dmil_core.files import write_file
-from services.cli.arguments import parse
-from services.cli.places import announce
-from services.cli.progress import Bar, console
+from services.cli.progress import Bar
 from services.rollouts.episodes import demonstrate
 from services.suites.base import TaskSuite
-from services.suites.registry import open_suite
 from services.suites.rendering import View, picture
 
-SUITES = (
-    "ml45", "ml10", "push-around-wall", "kitchen-topburner", "kitchen-microwave", "kitchen-kettle", "kitchen-slide",
-)  # fmt: skip
-"""The paper's, in the order of its Figures 6 to 9."""
-COLUMNS = {"ml45": 10, "kitchen": 4}
-"""Of pictures, by what a suite's name begins with."""
 HEIGHT, WIDTH = 180, 240
 MOMENT = 0.6
 """Each picture is taken after this part of the steps that the expert takes to solve the task."""
-
-
-@dataclass(frozen=True)
-class Arguments:
-    """Arguments of ``report gallery``."""
-
-    suites: tuple[str, ...] = SUITES
-    """Which suites."""
-    output: Path = Path("gallery")
-    """Folder for a picture of each suite, SUITE.jpg."""
-    seed: int = 0
-    """Of the episodes."""
-
-
-def run(arguments: Sequence[str]) -> None:
-    """Run the program."""
-    args = parse(Arguments, __doc__ or "", arguments, Arguments())
-    announce(gallery=(args.output, "--output FOLDER"))
-    for name in args.suites:
-        suite = open_suite(SuiteConfig(name=name))
-        camera: str | View | None = getattr(suite, "camera", None)
-        if camera is None:
-            raise UserError(f"--suites: got {name}, which names no camera; wanted suites whose tasks can be drawn")
-        path = args.output / f"{name}.jpg"
-        draw_gallery(suite, camera, args.seed, path, COLUMNS.get(name.partition("-")[0], 5))
-        console.print(str(path))
 
 
 def draw_gallery(suite: TaskSuite, camera: str | View, seed: int, path: Path, columns: int) -> None:

@@ -4,21 +4,23 @@ import itertools
 import math
 import re
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AliasChoices, Field, model_validator
 
 from dmil_core.configs import EvaluationConfig, ExperimentConfig, SuiteConfig, SuiteName, preset_of
-from dmil_core.devices import Compute, GradientPath
 from dmil_core.errors import UserError
 from dmil_core.seeding import named_rng
-from dmil_core.settings import Count, Flag, Seed, Settings
+from dmil_core.settings import Count, Flag, GradientPath, Seed, Settings
 from services.cli.composition import checked, method_named
 from services.cli.yaml_files import merged
 from services.evaluation.results import Metric
 from services.suites.base import Split
 from services.suites.registry import open_suite
+
+if TYPE_CHECKING:
+    from dmil_core.devices import Compute
 
 Name = Annotated[str, Field(min_length=1, max_length=60)]
 Overrides = dict[str, Any]
@@ -39,8 +41,10 @@ class Resources(Settings):
     """How a group's gradients are computed: loop, batched, or auto, which is batched on a GPU."""
 
     @property
-    def compute(self) -> Compute:
+    def compute(self) -> "Compute":
         """What computes."""
+        from dmil_core.devices import Compute
+
         return Compute(self.device, self.path)
 
     @model_validator(mode="after")

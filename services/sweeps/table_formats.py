@@ -1,27 +1,21 @@
-"""Lay the table of a sweep beside the paper's: on the terminal, in files of several forms, as a page, in MLflow."""
+"""The table of a sweep beside the paper's: on the terminal, in files of several forms, as a page, in MLflow."""
 
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
-import tyro
 import yaml
 from rich.table import Table
 
 from dmil_core.files import inside, write_file
 from dmil_core.statistics import interval_text
-from services.cli.arguments import parse
 from services.cli.escapes import for_csv, for_latex, for_markdown, one_line
-from services.cli.places import announce
 from services.cli.progress import console
 from services.evaluation.comparison import DIGITS, Cell, Difference, Unpaired
 from services.evaluation.summary import markdown_rows
 from services.reporting.comparison_pictures import draw_means
-from services.storage.run_folders import find_folder
-from services.sweeps.compare import write_sweep_page
 from services.sweeps.folders import MARK, TABLES, SweepFolder
+from services.sweeps.page import write_sweep_page
 from services.sweeps.tables import Sample, Tables, column_of, comparison_of, tables_of
 from services.tracking.tracker import Tracker
 
@@ -218,21 +212,3 @@ def _metric_name(cell: Cell) -> str:
     """Return a name of characters that MLflow takes."""
     name = f"{cell.row}/{cell.suite}/{cell.split}/{cell.shots}-shot"
     return "".join(c if c.isascii() and (c.isalnum() or c in "/_-. ") else "_" for c in name)
-
-
-@dataclass(frozen=True)
-class Arguments:
-    """Arguments of ``report tables``."""
-
-    sweep: tyro.conf.Positional[str]
-    """Name or folder of a sweep, which may be still under way."""
-    runs: Path = Path("runs")
-    """The folder that sweeps' own folders are in."""
-
-
-def run(arguments: Sequence[str]) -> None:
-    """Run the program."""
-    args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
-    sweep = SweepFolder(find_folder(args.sweep, args.runs, MARK, "SWEEP"))
-    announce(tables=(sweep.path / "tables", "--runs FOLDER"))
-    show(write_tables(sweep), sweep)

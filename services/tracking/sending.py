@@ -8,11 +8,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, TypeVar
 
-from dmil_core.checkpoint import Checkpoint, CheckpointError
 from dmil_core.checksums import sha256
 from dmil_core.errors import shorten
 from dmil_core.files import ForeignFileError, copy_plain, inside
-from services.tracking.models import log_model
 from services.tracking.spool import Artifact, Line, Measured, Trained
 
 if TYPE_CHECKING:
@@ -132,6 +130,9 @@ def _send_artifact(client: "MlflowClient", run_id: str, folder: Path, value: Art
 
 
 def _send_model(client: "MlflowClient", run_id: str, folder: Path, value: Trained) -> None:
+    from dmil_core.checkpoint import Checkpoint, CheckpointError
+    from services.tracking.models import log_model
+
     try:
         checkpoint = Checkpoint(inside(folder, value.checkpoint))
     except (CheckpointError, ForeignFileError) as error:

@@ -20,7 +20,7 @@ from services.distributed import metrics
 from services.evaluation import evaluator
 from services.experiments import meta_training
 from services.reporting import run_report
-from services.storage import run_folders
+from services.storage import replication, run_folders
 from services.storage.checkpoints import Checkpoints
 from tests.faults.conftest import SHORT, TOY
 
@@ -273,7 +273,7 @@ def test_a_folder_that_is_moved_away_amid_the_evaluation_is_not_made_anew(workpl
 
 def test_a_folder_that_is_moved_away_at_the_start_is_not_made_anew(workplace, monkeypatch, capsys):
     monkeypatch.setenv("DMIL_STORAGE", f"file://{workplace / 'bucket'}")
-    monkeypatch.setattr(meta_train, "claim_name", lambda folder: folder.rename(workplace / "moved"))
+    monkeypatch.setattr(replication, "claim_name", lambda folder: folder.rename(workplace / "moved"))
     assert exit_code(meta_train.run, [*TOY, *SHORT, "--name", "run"]) == 1
     assert "error: runs/run: got no such folder any more" in capsys.readouterr().err
     assert not (workplace / "runs" / "run").exists()

@@ -14,7 +14,7 @@ from dmil_core.adapted_policy import Source
 from dmil_core.checkpoint import Manifest
 from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import UserError
-from dmil_core.methods.registry import OURS, config_type
+from dmil_core.methods.configs import OURS, config_type
 from services import evaluate, inspect_demos, meta_train
 from services.cli.arguments import parse, peek
 from services.cli.composition import EARLY, config_from
@@ -186,9 +186,9 @@ def test_a_name_is_text_wherever_it_is_shown(train, capsys, name: str):
     odd = folder.rename(folder.with_name(name.replace("/", "∕")))
     train(odd.name, "--training.iterations", "5", resume=True)
     (odd / "report" / "report.html").unlink()
-    from services.reporting import run_report
+    from services import report_run
 
-    run_report.run([str(odd)])
+    report_run.run([str(odd)])
     assert (odd / "report" / "report.html").read_text().count("<b>&amp;") == 0
     draw = np.random.default_rng(0)
     Path("a[").mkdir()

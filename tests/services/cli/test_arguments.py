@@ -1,10 +1,10 @@
 """Settings from preset, file and flags, and mistakes that are answered with what is allowed."""
 
+import json
+import os
 import shutil
 import subprocess
 import sys
-from contextlib import suppress
-from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -165,28 +165,50 @@ def test_a_mistake_ends_the_program_with_exit_code_2(programs):
     assert "Traceback" not in printed
 
 
-@pytest.mark.parametrize(
-    "name", [path.stem for path in sorted(SERVICES.glob("[a-z]*.py")) if path.stem != "checkpoints"]
-)
-def test_each_program_explains_itself(name: str, capsys: pytest.CaptureFixture[str], monkeypatch):
+EXPLAINED = [path.stem for path in sorted(SERVICES.glob("[a-z]*.py")) if path.stem != "checkpoints"]
+EXPLAINED.append("tracking.__main__")
+EXPLAIN = """
+import io, json, sys
+from contextlib import redirect_stdout
+from importlib import import_module
+
+told = {}
+for name in sys.argv[1:]:
     run = import_module(f"services.{name}").run
+    for called in ("python", "dmil"):
+        sys.argv[0] = f"/x/{called}"
+        with redirect_stdout(io.StringIO()) as text:
+            try:
+                run(["--help"])
+            except SystemExit as end:
+                assert not end.code, text.getvalue()
+        told[f"{called} {name}"] = text.getvalue()
+    slow = sys.modules.keys() & {"torch", "ray", "mlflow"}
+    assert not slow, f"{name} imports {slow} for --help"
+print(json.dumps(told))
+"""
+
+
+@pytest.fixture(scope="module")
+def explanations() -> dict[str, str]:
+    """What each program prints on --help, as called by python or dmil; all in one process, without what is slow."""
+    command = [sys.executable, "-c", EXPLAIN, *EXPLAINED]
+    asked = subprocess.run(command, env=os.environ | {"COLUMNS": "100"}, capture_output=True, text=True)
+    assert asked.returncode == 0, asked.stderr
+    return json.loads(asked.stdout)
+
+
+@pytest.mark.parametrize("name", EXPLAINED)
+def test_each_program_explains_itself(name: str, explanations: dict[str, str]):
     words = COMMANDS.get(f"services.{name}", f"services.{name}").removeprefix("services.")
     program, _, rest = words.partition(" ")
-    for called, usage in (
-        ("python", f"python -m services.{words}"),
-        ("dmil", f"dmil {program.replace('_', '-')} {rest}"),
-    ):
-        monkeypatch.setattr("sys.argv", [f"/x/{called}"])
-        with suppress(SystemExit):
-            run(["--help"])
-        assert f"usage: {usage.rstrip()} " in capsys.readouterr().out
+    assert f"usage: python -m services.{words} " in explanations[f"python {name}"]
+    usage = f"usage: dmil {program.replace('_', '-')} {rest}"
+    assert f"{usage.rstrip()} " in explanations[f"dmil {name}"]
 
 
-def test_help_is_in_paragraphs_with_an_example(capsys: pytest.CaptureFixture[str], monkeypatch):
-    monkeypatch.setenv("COLUMNS", "100")
-    with suppress(SystemExit):
-        run(["--help"])
-    lines = [line.strip(" │") for line in capsys.readouterr().out.splitlines()]
+def test_help_is_in_paragraphs_with_an_example(explanations: dict[str, str]):
+    lines = [line.strip(" │") for line in explanations["dmil meta_train"].splitlines()]
     assert "dmil meta-train --preset ml10-quick" in lines
     assert any("smoke (a minute); also with" in line for line in lines), "a docstring's own line ends there"
 

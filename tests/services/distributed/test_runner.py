@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from dmil_core.devices import Compute, GradientPath
+from dmil_core.devices import Compute
 from dmil_core.outer_loop import add, groups
 from dmil_core.settings import GradientPath
 from services.demonstrations.store import DemoStore
 from services.distributed.adaptation_worker import AdaptationWorker, Block
 from services.distributed.chunking import CHUNK_LENGTH, from_chunks, to_chunks
+from services.distributed.cluster import RunnerKind
 from services.distributed.learner import Learner
 from services.distributed.ray_meta_training import RayMetaTraining
-from services.distributed.ray_runner import RunnerKind, open_runner
+from services.distributed.ray_runner import open_runner
 from services.distributed.runner import Runner
 from services.distributed.timing import Span, Timing
 from services.evaluation.results import EpisodeResult

@@ -7,7 +7,8 @@ from PIL import Image
 
 from dmil_core.configs import PRESETS, SuiteConfig
 from services import report
-from services.reporting.gallery import SUITES, draw_gallery, run
+from services.report_gallery import SUITES, run
+from services.reporting.gallery import draw_gallery
 from services.suites.registry import open_suite
 from services.suites.rendering import RenderingError
 

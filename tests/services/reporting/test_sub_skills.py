@@ -9,10 +9,10 @@ import pytest
 
 from dmil_core.errors import UserError
 from dmil_core.methods.base import FineTuning
+from services import report_sub_skills
 from services.distributed.runner import LocalRunner
 from services.evaluation.results import EpisodeResult, read_rows
 from services.experiments.finished_run import FinishedRun
-from services.reporting import sub_skill_report
 from services.reporting.choices import DEMONSTRATIONS, ROLLOUTS, Choices, Timeline, choices_on
 from services.reporting.drawing import COLOURS, Picture, colour_of, ink_on
 from services.reporting.page import DataTable
@@ -175,7 +175,7 @@ def test_the_program_writes_one_page_of_several_runs_and_of_tasks_that_are_not_t
     suite = {"train_tasks": ("red-green-blue", "red-blue-green"), "test_tasks": ("green-red-blue",)}
     trained("first", suite=suite)
     trained("second", "option-gail-offline", suite=suite)
-    sub_skill_report.run(["DMIL=first", "second", "--tasks", TASK, "green-red-blue", "--output", "page.html"])
+    report_sub_skills.run(["DMIL=first", "second", "--tasks", TASK, "green-red-blue", "--output", "page.html"])
     opened = open_page(planar_visits / "page.html")
     assert opened.requests == opened.complaints == opened.faults() == []
     assert opened.page.locator("h2").all_inner_texts() == [
@@ -208,4 +208,4 @@ def test_mistakes_are_reported(trained: Trained, complaint, arguments: list[str]
         trained("flat", "behaviour-cloning")
     if "A=longer" in arguments:
         trained("longer", demonstrations={"per_task": 12, "held_out": 8})
-    assert message in complaint(sub_skill_report.run, *arguments)
+    assert message in complaint(report_sub_skills.run, *arguments)

@@ -11,14 +11,8 @@ from dmil_core.errors import UserError
 from dmil_core.files import inside
 from services.cli.arguments import parse
 from services.cli.places import announce
-from services.evaluation.comparison import Comparison
-from services.experiments.finished_run import FinishedRun
-from services.reporting.comparison import compare_runs
-from services.reporting.page import Commands
-from services.reporting.side_by_side import write_comparison
 from services.storage.run_folders import find_folder
 from services.sweeps.folders import MARK, TABLES, SweepFolder
-from services.sweeps.tables import Tables, comparison_of, tables_of
 
 
 @dataclass(frozen=True)
@@ -48,6 +42,9 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _of_sweep(name: str, args: Arguments) -> None:
+    from services.sweeps.page import write_sweep_page
+    from services.sweeps.tables import comparison_of, tables_of
+
     sweep = SweepFolder(find_folder(name, args.runs, MARK, "SWEEP"))
     rows = sweep.record.sweep.row_names
     if args.baseline is not None and args.baseline not in rows:
@@ -59,6 +56,11 @@ def _of_sweep(name: str, args: Arguments) -> None:
 
 
 def _of_runs(args: Arguments) -> None:
+    from services.experiments.finished_run import FinishedRun
+    from services.reporting.comparison import compare_runs
+    from services.reporting.page import Commands
+    from services.reporting.side_by_side import write_comparison
+
     if len(args.names) < 2:
         raise UserError(f"RUN: got {' '.join(args.names) or 'none'}; wanted two finished runs or more, or one sweep")
     runs = [FinishedRun.find(name, args.runs) for name in args.names]
@@ -73,19 +75,3 @@ def _of_runs(args: Arguments) -> None:
     ]
     title = f"{', '.join(comparison.rows)} side by side"
     write_comparison(path, title, lead, comparison, [Commands("To make this page again", [shlex.join(again)])])
-
-
-def write_sweep_page(tables: Tables, comparison: Comparison, path: Path) -> None:
-    """Write the page of a sweep.
-
-    Raises:
-        DiskFullError: for want of space.
-    """
-    trials = ", ".join(f"{count} {status}" for status, count in tables.trials.items())
-    paper = f" Beside it stands {tables.paper.replace('table', 'Table ')} of the paper." if tables.paper else ""
-    lead = [
-        f"{tables.metric.replace('_', ' ').capitalize()} at preset {tables.preset}; trials: {trials}.{paper} Begun "
-        f"{tables.began}, commit {tables.commit[:12]}."
-    ]
-    lead += [f"Failed: {name}: {error}" for name, error in tables.failed.items()]
-    write_comparison(path, tables.what, lead, comparison, [Commands("The sweep", [tables.command])])

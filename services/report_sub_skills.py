@@ -8,20 +8,19 @@ experts demonstrate those that there are no demonstrations of.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import torch
 import tyro
 
 from dmil_core.errors import UserError
 from services.cli.arguments import parse
 from services.cli.places import announce
-from services.experiments.finished_run import FinishedRun
-from services.reporting.embedding import PERPLEXITY, SEED, embedding_section
-from services.reporting.embedding import SHOTS as EMBEDDING_SHOTS
-from services.reporting.page import DataTable, Prose, write_page
-from services.reporting.run_group import RunGroup, group_runs, has_sub_skills
-from services.reporting.sub_skills import sub_skill_sections
 from services.storage.run_folders import find_folder
+
+if TYPE_CHECKING:
+    from services.experiments.finished_run import FinishedRun
+    from services.reporting.page import DataTable
+    from services.reporting.run_group import RunGroup
 
 MARK = "config.json"
 """What the folder of a run, or of a configuration that a sweep has trained, is known by."""
@@ -40,11 +39,11 @@ class Arguments:
     """Demonstrations to adapt to for timelines and statistics; one, as in Figure 4b."""
     rollouts: int = 3
     """Episodes to run for each run and task, before adaptation and after."""
-    embedding_shots: int = EMBEDDING_SHOTS
+    embedding_shots: int = 3
     """Demonstrations to adapt to for the t-SNE; three, as in Figure 4a."""
-    perplexity: float = PERPLEXITY
+    perplexity: float = 30.0
     """Of the t-SNE."""
-    seed: int = SEED
+    seed: int = 0
     """Of the t-SNE."""
     output: Path = Path("sub-skills.html")
     """File to write."""
@@ -57,6 +56,13 @@ def run(arguments: Sequence[str]) -> None:
     args = parse(Arguments, __doc__ or "", arguments, Arguments(tyro.MISSING))
     _check(args)
     announce(page=(args.output, "--output FILE"))
+    import torch
+
+    from services.reporting.embedding import embedding_section
+    from services.reporting.page import Prose, write_page
+    from services.reporting.run_group import group_runs
+    from services.reporting.sub_skills import sub_skill_sections
+
     torch.set_num_threads(1)
     group = group_runs(_labelled_runs(args.which, args.runs), args.tasks)
     sections = sub_skill_sections(group, args.shots, args.rollouts)
@@ -80,12 +86,15 @@ def _check(args: Arguments) -> None:
             raise UserError(f"--{name.replace('_', '-')}: got {got}; wanted at least {bound}")
 
 
-def _labelled_runs(which: Sequence[str], runs: Path) -> dict[str, FinishedRun]:
+def _labelled_runs(which: Sequence[str], runs: Path) -> "dict[str, FinishedRun]":
     """Return the runs by their labels.
 
     Raises:
         UserError: for none at all, two of one label, or one that there is not.
     """
+    from services.experiments.finished_run import FinishedRun
+    from services.reporting.run_group import has_sub_skills
+
     by_label: dict[str, FinishedRun] = {}
     for named in which:
         label, _, name = named.rpartition("=")
@@ -99,7 +108,9 @@ def _labelled_runs(which: Sequence[str], runs: Path) -> dict[str, FinishedRun]:
     return by_label
 
 
-def _runs_table(group: RunGroup) -> DataTable:
+def _runs_table(group: "RunGroup") -> "DataTable":
+    from services.reporting.page import DataTable
+
     rows = []
     for label, run in group.runs.items():
         evaluation, checkpoint = run.config.evaluation, run.checkpoint
