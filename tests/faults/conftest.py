@@ -9,6 +9,7 @@ import pytest
 from services import meta_train
 from tests.faults.toy_package import install
 from tests.services import conftest as services
+from tests.services.programs import Programs
 
 _console, complaint, logged = services._console, services.complaint, services.logged  # fixtures
 mlflow_file, mlflow_server, wait_for = services.mlflow_file, services.mlflow_server, services.wait_for_fixture
@@ -64,8 +65,8 @@ def train(workplace: Path) -> Callable[..., Path]:
 
 
 @pytest.fixture
-def programs(workplace: Path) -> Iterator[services.Programs]:
+def programs(workplace: Path) -> Iterator[Programs]:
     """Starts programs as a user does, in the test's working directory and environment."""
-    programs = services.Programs()
+    programs = Programs()
     yield programs
     programs.kill()

@@ -20,7 +20,7 @@ from services.tracking import sending
 from services.tracking.delivery import REFUSED, Delivery, Identity
 from services.tracking.sending import acceptable
 from services.tracking.tracker import Tracker
-from tests.services.conftest import Server
+from tests.services.programs import Server
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from services.storage.checkpoints import Checkpoints
-from tests.services.conftest import QUICK_EVALUATION
+from tests.services.programs import QUICK_EVALUATION
 
 PROJECT = Path(__file__).parents[2]
 

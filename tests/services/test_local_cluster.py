@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 from services import local_cluster
-from tests.services.conftest import shared_memory_of
+from tests.services.programs import shared_memory_of
 
 JOB = """import os, pathlib
 from services.tracking.client import connect

@@ -21,7 +21,7 @@ from services.evaluation.results import EpisodeResult
 from services.storage.checkpoints import Checkpoints
 from services.tracking.models import models_of
 from services.tracking.spool import read_spool
-from tests.services.conftest import shared_memory_of
+from tests.services.programs import shared_memory_of
 
 LOSSES = {"high_loss_before", "high_loss_after", "low_loss_before", "low_loss_after", "continuity_loss"}
 

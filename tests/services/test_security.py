@@ -20,7 +20,7 @@ import pytest
 
 from services.storage.checkpoints import Checkpoints
 from services.tracking.tracker import Tracker
-from tests.services.conftest import QUICK_EVALUATION
+from tests.services.programs import QUICK_EVALUATION
 
 PROJECT = Path(__file__).parents[2]
 SECURED_BY = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "RAY_USAGE_STATS_ENABLED")

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from tests.services.conftest import QUICK_EVALUATION
+from tests.services.programs import QUICK_EVALUATION
 
 PROJECT = Path(__file__).parents[2]
 POSTGRES = max(Path("/usr/lib/postgresql").glob("*/bin"), default=Path("postgresql-is-not-installed"))

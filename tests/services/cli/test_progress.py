@@ -15,7 +15,7 @@ import pytest
 
 from services.cli.live_view import Status
 from services.cli.progress import Bar, Output
-from tests.services.conftest import QUICK_EVALUATION
+from tests.services.programs import QUICK_EVALUATION
 
 HIDDEN, SHOWN = "\x1b[?25l", "\x1b[?25h"
 """What a terminal is sent to hide its cursor, and to show it again."""

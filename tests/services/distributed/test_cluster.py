@@ -13,7 +13,7 @@ import pytest
 from dmil_core.errors import UserError
 from services.distributed import cluster as own
 from services.distributed.cluster import joined, named_address
-from tests.services.conftest import Cluster
+from tests.services.programs import Cluster
 
 
 @pytest.fixture

@@ -15,7 +15,8 @@ from services.evaluation.comparison import Difference
 from services.experiments.champions import is_better
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.ownership import IDENTITY
-from tests.services.conftest import Server, without_pictures
+from tests.services.conftest import without_pictures
+from tests.services.programs import Server
 
 NAME = "ml10-part"
 TASKS = ("--suite.train-tasks", "drawer-close", "--suite.test-tasks", "door-close")

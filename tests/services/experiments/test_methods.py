@@ -34,8 +34,8 @@ from services.distributed.simulation_worker import SimulationWorker
 from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoints
 from services.suites.metaworld import MetaWorldSuite
-from tests.services.conftest import QUICK_EVALUATION
 from tests.services.distributed.courses import alone, assert_same_bits, follow, pid_of, plan_of
+from tests.services.programs import QUICK_EVALUATION
 
 PROJECT = Path(__file__).parents[3]
 LEARNERS = [name for name, kind in OURS.items() if issubclass(kind, MetaLearner)]

@@ -15,8 +15,8 @@ from services import meta_train
 from services.demonstrations.store import DemoStore
 from services.evaluation.results import EpisodeResult, read_rows
 from services.storage.checkpoints import Checkpoints
-from tests.services.conftest import QUICK_EVALUATION
 from tests.services.experiments.same_bits import METHODS, RUNS, processor, train
+from tests.services.programs import QUICK_EVALUATION
 
 pytestmark = pytest.mark.usefixtures("plain_pages")
 KNOWN = json.loads(Path(__file__).with_name("same_bits.json").read_text())

@@ -15,7 +15,7 @@ from services.cli.arguments import exit_code
 from services.demonstrations.store import DemoStore
 from services.evaluation.results import EpisodeResult, write_rows
 from services.storage.checkpoints import Checkpoints
-from tests.services.conftest import QUICK_EVALUATION
+from tests.services.programs import QUICK_EVALUATION
 
 
 @pytest.fixture

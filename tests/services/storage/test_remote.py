@@ -24,7 +24,7 @@ from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoints
 from services.storage.remote import STORAGE, Storage
 from services.storage.replication import Replica, replicated
-from tests.services.conftest import QUICK_EVALUATION
+from tests.services.programs import QUICK_EVALUATION
 
 S3 = {"AWS_ACCESS_KEY_ID": "any", "AWS_SECRET_ACCESS_KEY": "any", "AWS_DEFAULT_REGION": "us-east-1"}
 

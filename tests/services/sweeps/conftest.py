@@ -10,7 +10,7 @@ from mlflow.entities import Run
 from ray.util.placement_group import placement_group
 
 from services.distributed import cluster
-from tests.services.conftest import Cluster
+from tests.services.programs import Cluster
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,7 @@ from services.experiments.finished_run import FinishedRun
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.delivery import Identity
 from services.tracking.links import comparison_link, run_link
-from tests.services.conftest import QUICK_EVALUATION, Server
+from tests.services.programs import QUICK_EVALUATION, Server
 
 pytestmark = pytest.mark.thorough
 MILLISECONDS = 60_000

@@ -16,7 +16,7 @@ from services.tracking import tracker as tracking
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.delivery import Identity
 from services.tracking.tracker import Tracker
-from tests.services.conftest import Server
+from tests.services.programs import Server
 from tests.services.tracking.conftest import records, steps
 
 
