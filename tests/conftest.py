@@ -8,6 +8,8 @@ from typing import Any
 import jaxtyping
 import pytest
 
+from tests.services.programs import ON_RAY
+
 # Ray reads these when it is first imported, after this file, here and in every program that a test starts.
 os.environ |= {
     "RAY_AUTH_MODE": "token",
@@ -55,7 +57,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     Before all others go those that share a Ray cluster, which then ends.
     """
-    on_ray = {item.path for item in items if {"cluster", "joined"} & set(getattr(item, "fixturenames", ()))}
+    on_ray = {item.path for item in items if not ON_RAY.isdisjoint(getattr(item, "fixturenames", ()))}
 
     def place(item: pytest.Item) -> tuple[bool, int]:
         name = item.path.name

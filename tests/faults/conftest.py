@@ -1,7 +1,7 @@
 """What the tests of faults share: the toy suite as an installed package, and small runs of it."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -9,7 +9,6 @@ import pytest
 from services import meta_train
 from tests.faults.toy_package import install
 from tests.services import conftest as services
-from tests.services.programs import Programs
 
 _console, complaint, logged = services._console, services.complaint, services.logged  # fixtures
 mlflow_file, mlflow_server, wait_for = services.mlflow_file, services.mlflow_server, services.wait_for_fixture
@@ -62,11 +61,3 @@ def train(workplace: Path) -> Callable[..., Path]:
         return workplace / "runs" / name
 
     return run
-
-
-@pytest.fixture
-def programs(workplace: Path) -> Iterator[Programs]:
-    """Starts programs as a user does, in the test's working directory and environment."""
-    programs = Programs()
-    yield programs
-    programs.kill()

@@ -1,4 +1,4 @@
-"""What the tests of the service share: one small store of demonstrations, one Ray cluster, and the programs."""
+"""What the tests of the service share: one small store of demonstrations and runs on it, one Ray cluster."""
 
 import functools
 import json
