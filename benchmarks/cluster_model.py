@@ -95,17 +95,10 @@ def seconds_of_a_tree(costs: Costs, network: Network, terms: int, fan_in: int) -
 def predict(
     costs: Costs, network: Network, workers: int, slots: int, fan_in: int, *, relayed: bool, together: int = 1
 ) -> Prediction:
-    """Return T(W) of ``docs/performance.md``, for one block a worker.
+    """Return T(W) of ``docs/performance.md``, W being `workers` and f `fan_in`, for one block a worker.
 
-    Args:
-        costs: measured.
-        network: assumed.
-        workers: W; there is work for no more than there are groups of slots.
-        slots: of all workers together.
-        fan_in: f.
-        relayed: a node passes the parameters on to others as soon as it has them; else all fetch them from the
-            learner's node.
-        together: slots of a group, which one worker computes.
+    There is work for no more workers than there are groups of slots, of `together` slots each. If `relayed`, a node
+    passes the parameters on to others as soon as it has them; else all fetch them from the learner's node.
     """
     groups = -(-slots // together)
     workers = min(workers, groups)

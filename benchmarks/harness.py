@@ -48,16 +48,11 @@ def alternate(
     prepare: Mapping[str, Callable[[], object]] | None = None,
     clock: Callable[[], float] | None = None,
 ) -> dict[str, list[float]]:
-    """Time functions in alternation, so that whatever else the machine does meets all of them alike.
+    """Return the seconds of each function's calls, in order: take medians, and ratios of medians.
 
-    Args:
-        functions: by name, each without arguments.
-        rounds: how often each is called; every other round goes backwards, so that none always follows the same.
-        prepare: what is to be called before each call of the function of that name, untimed.
-        clock: if not that of the wall.
-
-    Returns:
-        For each name the seconds of its calls, in order: take medians, and ratios of medians.
+    The functions take turns, so that whatever else the machine does meets all of them alike; every other round goes
+    backwards, so that none always follows the same. What `prepare` has under a function's name is called before it,
+    untimed. The clock is that of the wall if none is given.
     """
     clock = clock or time.perf_counter
     seconds: dict[str, list[float]] = {name: [] for name in functions}

@@ -60,12 +60,7 @@ def as_in_a_run(parameters: Parameters) -> Parameters:
 
 
 def made_up_plan(preset: str, slots_per_group: int | None = None) -> Plan:
-    """Return the plan of one of Meta-World's presets, with demonstrations of noise, 100 steps each.
-
-    Args:
-        preset: its name.
-        slots_per_group: if not the preset's.
-    """
+    """Return the plan of one of Meta-World's presets, with demonstrations of noise, 100 steps each."""
     config = PRESETS[preset]
     suite = MetaWorldSuite(config.suite)
     settings, training = config.demonstrations, config.training

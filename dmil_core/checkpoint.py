@@ -299,11 +299,9 @@ def inside_run(folder: Path, path: Path) -> Path:
 
 
 def newest(folder: Path, warn: Callable[[str], object]) -> Checkpoint:
-    """Read the newest checkpoint in `folder` that is whole.
+    """Read the newest checkpoint that is whole in `folder`, the folder ``checkpoints`` of a run.
 
-    Args:
-        folder: the folder ``checkpoints`` of a run.
-        warn: receives in words which ones that are newer are damaged, if there are any.
+    `warn` receives in words which newer ones are damaged, if there are any.
 
     Raises:
         CheckpointError: if there is none.

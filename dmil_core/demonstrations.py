@@ -125,13 +125,8 @@ def sample_task_batch(
     """Draw {τ1}..{τ4} of Algorithm 1 for one task, `trajectories` in each.
 
     The four sets are disjoint when the task has 4 x `trajectories` demonstrations; with fewer, each set is drawn
-    without replacement, and where even that is not possible, with it.
-
-    Args:
-        demonstrations: all training demonstrations of one task.
-        trajectories: the number of trajectories in each set.
-        window: cut each to so many consecutive steps at a random place; `None` takes them whole.
-        rng: where the choice comes from.
+    without replacement, and where even that is not possible, with it. Each trajectory is cut to `window` consecutive
+    steps at a random place, or taken whole.
 
     Raises:
         DemonstrationError: if there is no demonstration.
@@ -175,13 +170,11 @@ class Normalisation:
     def of(
         cls, demonstrations: Sequence[Demonstration], floor: float = 0.02, features: Features | None = None
     ) -> "Normalisation":
-        """Take mean and standard deviation over all steps of `demonstrations`.
+        """Take mean and standard deviation over all steps of the demonstrations of all meta-training tasks.
 
-        Args:
-            demonstrations: of all meta-training tasks.
-            floor: the least scale, in the observation's units: a coordinate that hardly moves in meta-training may
-                move in a new task, and must not then drown all others.
-            features: what networks see of observations, if not those.
+        `floor` is the least scale, in the observation's units: a coordinate that hardly moves in meta-training may move
+        in a new task, and must not then drown all others. `features` are what networks see of observations, if not
+        those.
         """
         observations = np.concatenate([demonstration.observations for demonstration in demonstrations])
         steps = (observations if features is None else features(observations)).astype(np.float64)

@@ -68,11 +68,9 @@ USUAL = Compute()
 
 
 def device_of(name: str, *, granted: bool = False) -> torch.device:
-    """Return the device that a name means in this process, ready for deterministic algorithms if it is a GPU.
+    """Return the device that auto, cpu, cuda or cuda:N means in this process; a GPU is made ready to be deterministic.
 
-    Args:
-        name: auto, cpu, cuda or cuda:N.
-        granted: whether Ray gave this process a GPU, which is what auto takes.
+    auto takes a GPU if it is `granted`: if Ray gave this process one.
 
     Raises:
         UserError: for another name, or a GPU that there is not.

@@ -51,11 +51,7 @@ class WorkError(RuntimeError):
 
 @contextmanager
 def as_work_error(label: str, **key: str | int) -> Iterator[None]:
-    """Raise an error inside as a `WorkError`, unless it is one already or the user's mistake.
-
-    Args:
-        label: name of the work item in messages.
-        key: what identifies the item among all.
+    """Raise an error inside as a `WorkError` of this label and key, unless it is one already or the user's mistake.
 
     Raises:
         WorkError: names the item.
@@ -98,10 +94,7 @@ def nearest(name: object, known: Iterable[str]) -> str:
 def describe_errors(error: ValidationError, whole: str = "settings", separator: str = "\n") -> str:
     """Return each wrong value, of the first ones: the key, what it got, and what was wanted.
 
-    Args:
-        error: of a model of pydantic's.
-        whole: what to name where no key is to blame.
-        separator: what stands between two of them.
+    `whole` is named where no key is to blame.
     """
     problems = error.errors(include_url=False)
     lines: list[str] = []

@@ -260,10 +260,7 @@ def write_file(root: Path, name: Name, content: str | bytes) -> None:
 def making_folder(root: Path, name: Name, *, instead: bool = False) -> Iterator[Path]:
     """Make a folder whole or not at all: what is written into the one given, beside it, is synced and renamed.
 
-    Args:
-        root: the folder that it lies below.
-        name: of the new folder.
-        instead: remove what has that name by then.
+    With `instead` it takes the place of what has its name by then.
 
     Raises:
         FileExistsError: if there is one of that name by then.

@@ -157,12 +157,7 @@ def load(name: str | Path, runs: str | Path = "runs", device: str = "cpu") -> Mo
 
 
 def model_folder(name: str | Path, runs: str | Path = "runs", field: str = "name") -> Path:
-    """Return the folder of a run or of a checkpoint on this machine, as `load` finds it.
-
-    Args:
-        name: as `load`'s, but no address.
-        runs: the folder that runs' own folders are in.
-        field: what to name in a message.
+    """Return the folder of a run or of a checkpoint on this machine, as `load` finds it; messages name `field`.
 
     Raises:
         UserError: if there is none; names the nearest ones.

@@ -34,12 +34,9 @@ def initialise(
 ) -> Parameters:
     """Draw the parameters of a perceptron: He-uniform weights (He et al. 2015), zero biases.
 
-    Args:
-        prefix: what the names begin with: ``{prefix}.{layer}.weight`` and ``{prefix}.{layer}.bias``.
-        sizes: units from the input to the output, both included.
-        rng: where the weights are drawn from.
-        copies: draw a bank of so many networks, stacked along a first axis.
-        output_scale: scale of the output layer's weights, against He's.
+    They are named ``{prefix}.{layer}.weight`` and ``{prefix}.{layer}.bias``. `sizes` are units from the input to the
+    output, both included; `copies` draws a bank of so many networks, stacked along a first axis; `output_scale` is that
+    of the output layer's weights, against He's.
     """
     generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
     batch = () if copies is None else (copies,)

@@ -112,16 +112,10 @@ def group_gradient(
 ) -> GroupGradient:
     """Return the summed outer gradient of some slots of an iteration: a pure function of its arguments.
 
-    Args:
-        method: what learns.
-        demonstrations: the training demonstrations of each meta-training task.
-        parameters: θ at the start of the iteration; they are on the device that computes.
-        seed: of the experiment.
-        iteration: counts from 0.
-        tasks: the task of every slot of the iteration, see `tasks_of`.
-        slots: which of them to compute.
-        collect_rollouts: lets a policy act in a task's environments, for a `OnlineMetaLearner`.
-        batched: compute all slots at once, see `MetaLearner.task_gradients`.
+    `parameters` are θ at the start of the iteration, which counts from 0, on the device that computes. `tasks` are
+    those of every slot, see `tasks_of`, and `slots` the ones to compute: all at once if `batched`, see
+    `MetaLearner.task_gradients`. `collect_rollouts` lets the policy of an `OnlineMetaLearner` act in a task's
+    environments.
 
     Raises:
         WorkError: for a Python error in one of them, which is named.

@@ -13,10 +13,7 @@ def plug_ins(group: str, ours: Callable[[str], str | None]) -> dict[str, Any]:
     """Return the entry points of a group by name; nothing of their packages is imported.
 
     Their class is this Python's, or that of the backport ``importlib_metadata`` where somebody has imported that.
-
-    Args:
-        group: of entry points.
-        ours: returns what of our own has a name, in words, or None.
+    `ours` returns what of our own has a name, in words, or None.
 
     Raises:
         UserError: if a package registers a name of ours, or two packages one name; whatever name is asked for.
@@ -37,11 +34,7 @@ def plug_ins(group: str, ours: Callable[[str], str | None]) -> dict[str, Any]:
 
 
 def imported(point: Any, field: str) -> Any:
-    """Import what an entry point names.
-
-    Args:
-        point: of `plug_ins`.
-        field: the setting that asks for it.
+    """Import what an entry point of `plug_ins` names; `field` is the setting that asks for it.
 
     Raises:
         UserError: if the import raises anything, `SystemExit` too: only Ctrl-C passes through.

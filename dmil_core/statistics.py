@@ -79,12 +79,8 @@ def stratified_bootstrap(
     """Return the mean outcome with its percentile interval (Efron and Tibshirani 1993).
 
     Seeds are drawn with replacement, then for each of them the episodes of each task: so the interval covers what
-    training and what the episodes have to do with chance, while every task keeps its weight.
-
-    Args:
-        outcomes: of each episode; differences of paired episodes are outcomes too.
-        draw: the rng of the resampling.
-        confidence: of the interval.
+    training and what the episodes have to do with chance, while every task keeps its weight. Differences of paired
+    episodes are outcomes too.
     """
     seeds, tasks, episodes = outcomes.shape
     means = np.zeros((BOOTSTRAP_DRAWS, seeds))
@@ -101,10 +97,7 @@ def nested_bootstrap(
 ) -> Mean:
     """Return the mean outcome with the percentile interval that resamples tasks, their support sets, their episodes.
 
-    Args:
-        outcomes: of each episode, by task and support set; differences of paired episodes are outcomes too.
-        draw: the rng of the resampling.
-        confidence: of the interval.
+    Outcomes are by task and support set; differences of paired episodes are outcomes too.
     """
     means = []
     for _ in range(BOOTSTRAP_DRAWS):
@@ -144,12 +137,6 @@ def profile_band(
 
     Runs are drawn with replacement and every task keeps its weight. One training serves all tasks, so all runs of a
     seed are drawn together; Agarwal et al. draw those of each task for themselves, as where each had its own training.
-
-    Args:
-        runs: the success rate, or mean score, of each seed on each task.
-        thresholds: of the profile.
-        draw: the rng of the resampling.
-        confidence: of the band.
     """
     again = runs[draw.integers(len(runs), size=(BOOTSTRAP_DRAWS, len(runs)))]
     # Threshold by threshold: all at once would be draws x runs x thresholds numbers.

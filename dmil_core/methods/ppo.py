@@ -20,10 +20,7 @@ def clipped_surrogate(
 ) -> Float[Tensor, ""]:
     """Return mean min(ρA, clamp(ρ, 1 − ε, 1 + ε)A), to be maximised (Schulman et al. 2017, equation 7).
 
-    Args:
-        log_ratio: log ρ, of the policy now to the one that drew.
-        advantages: A of each draw.
-        clip: ε.
+    ρ is of the policy now to the one that drew, and ε is `clip`.
     """
     ratio = log_ratio.exp()
     return torch.minimum(ratio * advantages, ratio.clamp(1 - clip, 1 + clip) * advantages).mean()
@@ -34,11 +31,8 @@ def generalised_advantages(
 ) -> Float[np.ndarray, " steps"]:
     """Return A_t = Σ_l (γλ)^l δ_{t+l}, δ_t = r_t + γ V_{t+1} − V_t (Schulman et al. 2016), of one episode.
 
-    Args:
-        rewards: of each step.
-        values: V of each state, and of the one after the last step; 0 where there is no going on.
-        discount: γ.
-        trace: λ.
+    `values` are V of each state, and of the one after the last step: 0 where there is no going on. γ is `discount`, and
+    λ `trace`.
     """
     advantages = rewards + discount * values[1:] - values[:-1]
     for step in reversed(range(len(advantages) - 1)):
@@ -54,15 +48,10 @@ def trajectory_advantages(
     trace: float,
     last_values: Float[Tensor, " trajectories"] | None = None,
 ) -> Float[Tensor, " draws"]:
-    """Return the `generalised_advantages` within each trajectory.
+    """Return the `generalised_advantages` within each of several trajectories, which lie one after the other.
 
-    Args:
-        rewards: of trajectories one after the other.
-        values: V of the same draws.
-        lengths: of the trajectories.
-        discount: γ; with 0 they are r − V.
-        trace: λ.
-        last_values: V of the states after each trajectory's last step; 0 if there is no going on.
+    `last_values` are V of the states after each one's last step: 0 if there is no going on. With a discount of 0 the
+    advantages are r − V.
     """
     if not discount:
         return rewards - values

@@ -36,14 +36,9 @@ def defaults_from(early: Namespace) -> ExperimentConfig:
 def config_from(
     preset: str, file: Path | None, suite: str | None = None, method: str | None = None, demos: str | None = None
 ) -> ExperimentConfig:
-    """Return a preset's settings, with those that a YAML file gives in their place.
+    """Return a preset's settings, with those that a YAML file, and then the other arguments, give in their place.
 
-    Args:
-        preset: a size, or a suite and a size as ml10-quick.
-        file: of settings.
-        suite: in place of the preset's.
-        method: in place of the file's, or of DMIL.
-        demos: the source of demonstrations, in place of the file's.
+    A preset is a size, or a suite and a size as ml10-quick; `demos` is the source of demonstrations.
 
     Raises:
         UserError: names the key, what it got and what is allowed.

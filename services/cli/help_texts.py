@@ -85,9 +85,8 @@ def _told(make: Callable[..., Any]) -> Callable[..., Any]:
 def describe_flags(error: ValidationError, defaults: Any) -> str:
     """Return what is wrong with settings, a line for each of the flags.
 
-    Args:
-        error: of one of the models in `defaults`.
-        defaults: a program's arguments, in which the sections are found by their classes.
+    The error is of one of the models in `defaults`, a program's arguments, in which the sections are found by their
+    classes.
     """
     section = dict(_sections(defaults, "")).get(error.title, "")
     lines = []

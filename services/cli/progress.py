@@ -90,14 +90,9 @@ class Bar:
     def __init__(
         self, name: str, total: int, done: int = 0, unit: str = "", status: Callable[[], Status] | None = None
     ) -> None:
-        """Show `done` of `total`.
+        """Show `done` of `total`, and its rate if the `unit` is of interest.
 
-        Args:
-            name: of the phase.
-            total: how much there is to do.
-            done: of it.
-            unit: what is counted, where its rate is of interest.
-            status: returns what else to show; it is called from another thread.
+        `status` returns what else to show; it is called from another thread.
         """
         self._name, self._unit, self._text = name, unit, ""
         self._status = status or (lambda: Status(at=self._text))

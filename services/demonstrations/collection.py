@@ -30,12 +30,7 @@ class DemonstrationCollection:
     """The demonstrations of all tasks of an experiment."""
 
     def __init__(self, config: ExperimentConfig, suite: TaskSuite, store: DemoStore) -> None:
-        """Find out where they are; nothing is read or made yet.
-
-        Args:
-            config: of the experiment.
-            suite: of the experiment.
-            store: where the experts' demonstrations are, or will be.
+        """Find out where they are, the experts' in the store; nothing is read or made yet.
 
         Raises:
             DemonstrationError: for a source of demonstrations that there is not, or that is of no task of the suite.
@@ -45,14 +40,10 @@ class DemonstrationCollection:
         self._places = self._find_places()
 
     def collect(self, runner: Runner, only: Collection[str] | None = None) -> dict[str, TaskDemonstrations]:
-        """Return every task's demonstrations, letting the experts make those that are not in the store.
+        """Return the demonstrations of all tasks, or of some, letting the experts make those that are not in the store.
 
         The first successes in the order of the attempts' numbers are kept, so the outcome does not depend on who
         simulates what.
-
-        Args:
-            runner: does the work.
-            only: some of the tasks, to be evaluated alone.
 
         Raises:
             DemonstrationError: if an expert hardly ever succeeds, a task has none, or a data set cannot be used.
@@ -124,8 +115,7 @@ class DemonstrationCollection:
     def check_recorded(self, only: Collection[str] | None = None) -> None:
         """Read the data sets that the settings name, once, and see whether their demonstrations suffice.
 
-        Args:
-            only: the tasks that are evaluated, where none is trained on.
+        Where tasks are named, these are evaluated, and none is trained on.
 
         Raises:
             DemonstrationError: for one that cannot be used, or has too few demonstrations.

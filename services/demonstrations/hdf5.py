@@ -45,11 +45,7 @@ class PlainFile:
         return getattr(self._member(name), "shape", None) or ()
 
     def array(self, name: str, *, axes: int | None = None) -> np.ndarray:
-        """Return an array of numbers.
-
-        Args:
-            name: its path in the file.
-            axes: how many it must have; any number but none at all, if not given.
+        """Return the array of numbers under a path of the file, with so many axes, or with any but none at all.
 
         Raises:
             DemonstrationError: if there is none, it lies outside the file, holds no numbers, or is too large.

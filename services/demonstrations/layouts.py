@@ -38,9 +38,7 @@ KINDS = {
 def read_robomimic(file: PlainFile, keys: Sequence[str]) -> list[Arrays]:
     """Read ``data/demo_*/obs/*`` and ``data/demo_*/actions``, as robomimic and LIBERO have them.
 
-    Args:
-        file: opened.
-        keys: of the observations, laid one after the other in this order; all in alphabetical order if none.
+    The observations of these keys are laid one after the other, all in alphabetical order if there are none.
 
     Raises:
         DemonstrationError: for a key that is not there or no vector, as pictures are, with those that are.

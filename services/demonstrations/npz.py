@@ -233,11 +233,7 @@ def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str) ->
 def array_in(content: bytes, name: str, kinds: str, axes: tuple[int, ...]) -> np.ndarray:
     """Return the array of a .npy file, whose header is checked before memory is taken for it.
 
-    Args:
-        content: of the file.
-        name: of the array in messages.
-        kinds: of numbers that it may have, as `numpy.dtype.kind` names them.
-        axes: how many it may have.
+    It may have these `kinds` of numbers, as `numpy.dtype.kind` names them, and one of these numbers of `axes`.
 
     Raises:
         ValueError: if the header is not one of numpy's, or the array would have another size than there is.

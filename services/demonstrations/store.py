@@ -75,9 +75,7 @@ class DemoStore:
     def __init__(self, root: Path, storage: Storage | None = None) -> None:
         """Use the data sets under `root`, which is made with the first of them.
 
-        Args:
-            root: the folder.
-            storage: data sets that are not under the root are fetched from here, and new ones are copied to it.
+        Those that are not there are fetched from the storage, and new ones are copied to it.
         """
         self.root = root.resolve()
         self._storage = storage

@@ -74,10 +74,7 @@ class AdaptationWorker:
     def gradient(self, parameters: Chunks, block: Block, previous: Sequence[Any] = ()) -> tuple[BlockReport, Chunks]:
         """Return a block's report, and the sum of its gradients, which is all that must travel.
 
-        Args:
-            parameters: flat; they are copied first.
-            block: which slots of which iteration.
-            previous: Ray's references to the gradients of the blocks just before it, to be added.
+        Added to it are those of the blocks just before it, to which `previous` has Ray's references.
 
         Raises:
             WorkError: for a Python error in one of the slots.

@@ -24,12 +24,9 @@ def granted_gpu() -> bool:
 
 
 def gpus_of_each(compute: Compute, asked: float | None, workers: int) -> float:
-    """Return the GPUs of each worker in the cluster that was joined.
+    """Return the GPUs of each of so many workers in the cluster that was joined.
 
-    Args:
-        compute: what computes.
-        asked: GPUs of each worker; if not given, none, or an equal part of all where there must be one.
-        workers: of each kind.
+    If nobody asked for any: none, or an equal part of all where there must be one.
 
     Raises:
         UserError: if there must be one, and there is none.

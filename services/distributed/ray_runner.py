@@ -78,13 +78,9 @@ class RayRunner:
     ) -> None:
         """Join a cluster, or start one, see `services.distributed.cluster`.
 
-        Args:
-            suite: of the experiment's tasks.
-            workers: of each kind, by default one for each CPU of the cluster. Those that have no CPU yet join when
-                they have: an autoscaling cluster grows for them.
-            gpus: of each worker, at most one. If not given: none, or an equal part of the cluster's if there must be
-                one.
-            compute: what computes.
+        There are so many workers of each kind, by default one for each CPU of the cluster. Those that have no CPU yet
+        join when they have: an autoscaling cluster grows for them. Each has `gpus`, at most one; if not given none, or
+        an equal part of the cluster's if there must be one.
 
         Raises:
             UserError: if there must be a GPU, and the cluster has none.

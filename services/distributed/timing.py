@@ -38,10 +38,8 @@ class Timing(NamedTuple):
     def of(cls, ready: float, work: Mapping[int, Sequence[Span]], step: Span) -> "Timing":
         """Divide up one iteration.
 
-        Args:
-            ready: when its parameters were there, on the learner's clock.
-            work: the gradient calls of each worker that had one.
-            step: the outer step.
+        Its parameters were `ready` at a time on the learner's clock; `work` has the gradient calls of each worker that
+        had one.
         """
         begin = sum(min(span.started for span in spans) for spans in work.values()) / len(work)
         compute = sum(span.seconds for spans in work.values() for span in spans) / len(work)

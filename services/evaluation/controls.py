@@ -62,16 +62,10 @@ def control_items(
     training_sets: Mapping[str, Sequence[Demonstration]],
     held_out: Mapping[str, Sequence[Demonstration]],
 ) -> list[AdaptationRollouts]:
-    """Return the work items of a control, one for each of the run's own.
+    """Return the work items of a control, one for each of the run's own on meta-testing tasks.
 
-    Args:
-        control: which one.
-        items: of the run's checkpoint, on meta-testing tasks.
-        config: of the experiment.
-        action_dim: numbers in an action.
-        runner: shares what the items need.
-        training_sets: what a method without learning takes the scale of observations from.
-        held_out: of each task, the demonstrations that support sets are drawn from; of at least two tasks.
+    A method without learning takes the scale of observations from `training_sets`; support sets are drawn from
+    `held_out`, the demonstrations of at least two tasks.
     """
     if control == "no-adaptation":
         evaluation = config.evaluation.model_copy(update={"fine_tuning_steps": 0, "displaced": 0})

@@ -75,16 +75,7 @@ class Evaluator:
         data: Mapping[str, TaskDemonstrations],
         held_out: Mapping[str, Sequence[Demonstration]],
     ) -> None:
-        """Share the support demonstrations with the runner's workers.
-
-        Args:
-            runner: does the work.
-            config: of the experiment.
-            suite: of the experiment.
-            tasks: all tasks with their split.
-            data: every task's demonstrations.
-            held_out: of each task, those that support sets are drawn from.
-        """
+        """Share the demonstrations that support sets are drawn from, `held_out`, with the runner's workers."""
         self._runner, self.config, self._suite, self._data, self._held_out = runner, config, suite, data, held_out
         self.adaptations = plan_adaptations(tasks, config.evaluation, {task: len(held_out[task]) for task in held_out})
         self._shared = {task: runner.share(demonstrations) for task, demonstrations in held_out.items()}
@@ -160,15 +151,10 @@ class Evaluations:
     def __init__(
         self, runner: Runner, evaluator: Evaluator, checkpoints: Checkpoints, tracker: Tracker, *, overlap: bool
     ) -> None:
-        """Evaluate nothing yet.
+        """Evaluate nothing yet; with `overlap`, later beside meta-training.
 
-        Args:
-            runner: does the work.
-            evaluator: of the experiment.
-            checkpoints: of the run. The folder ``evaluations`` beside theirs gets a folder for each evaluation, named
-                by the iteration.
-            tracker: takes the success rates.
-            overlap: evaluate beside meta-training.
+        The folder ``evaluations`` beside that of the checkpoints gets a folder for each evaluation, named by the
+        iteration.
         """
         self._runner, self._evaluator, self._checkpoints, self._tracker = runner, evaluator, checkpoints, tracker
         self._run = checkpoints.folder.parent

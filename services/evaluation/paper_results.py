@@ -43,12 +43,8 @@ def _tables() -> dict[str, Any]:
 def figure(table: str, row: str, suite: str, split: Split, shots: int) -> Published | None:
     """Return the paper's figure, if it has one: a success rate (Tables 4, 6, 7, 8), or a score (Table 5).
 
-    Args:
-        table: as table4.
-        row: as the paper names it: a method or a variant, K=4, or a number of fine-tuning steps.
-        suite: as ml10 or kitchen-kettle.
-        split: of its tasks.
-        shots: demonstrations adapted to; Table 5 does not give their number: its figures stand beside all.
+    A table is named as table4, a row as the paper has it: a method or a variant, K=4, or a number of fine-tuning steps.
+    Table 5 does not give the number of shots: its figures stand beside all.
     """
     rows, title = _tables()[table]["rows"], f"Table {table.removeprefix('table')}"
     if table == "table5":

@@ -85,11 +85,9 @@ class Experiment:
         self._collection.check_recorded(self._to_collect(only))
 
     def collect(self, runner: Runner, only: Collection[str] | None = None) -> dict[str, TaskDemonstrations]:
-        """Return every task's demonstrations, see `DemonstrationCollection`.
+        """Return every task's demonstrations, see `DemonstrationCollection`; or some tasks', where nothing is trained.
 
-        Args:
-            runner: does the work.
-            only: the tasks that will be evaluated, where nothing is trained; controls need those of the others too.
+        Controls need those of the other tasks too.
 
         Raises:
             DemonstrationError: if an expert hardly ever succeeds, a task has none, or a data set cannot be used.
@@ -132,20 +130,11 @@ class Experiment:
         overlap_evaluation: bool = True,
         on_nonfinite: OnNonfinite = "stop",
     ) -> Checkpoint:
-        """Meta-train to the set number of iterations and return the last checkpoint.
+        """Meta-train to the set number of iterations, from `resume` on, and return the last checkpoint.
 
         Whatever ends it, it writes a checkpoint first, and drops an evaluation that is under way, which a resumed run
-        catches up on.
-
-        Args:
-            runner: does the work.
-            data: every task's demonstrations.
-            checkpoints: where to keep them; evaluations on the way are kept in ``evaluations`` beside.
-            tracker: takes the metrics of each iteration.
-            resume: go on from here.
-            overlap_evaluation: go on with meta-training during evaluations on the way.
-            on_nonfinite: what to do where a loss or a gradient is not finite: stop, or count the iteration as done
-                without its step.
+        catches up on. Evaluations on the way are kept in ``evaluations`` beside the checkpoints. Where a loss or a
+        gradient is not finite, it stops, or skips the step and counts the iteration as done.
 
         Raises:
             CheckpointError: if the checkpoint to go on from was trained on other demonstrations.
@@ -288,12 +277,7 @@ class Experiment:
 
 
 def check_settings(resume: Checkpoint, config: ExperimentConfig, origin: Path) -> None:
-    """Refuse to go on from a checkpoint with other settings than it was trained with.
-
-    Args:
-        resume: the checkpoint.
-        config: all settings that are meant.
-        origin: the file that has them.
+    """Refuse to go on from a checkpoint with other settings, those of the file `origin`, than it was trained with.
 
     Raises:
         UserError: names file and keys, or the number of iterations where that was passed already.

@@ -48,16 +48,10 @@ class CheckpointWriter:
         needed: Callable[[], Collection[Path]],
         path: Path | None = None,
     ) -> None:
-        """Write nothing yet.
+        """Write nothing yet: `manifest`, and `path` if it was written, are those of the state that is gone on from.
 
-        Args:
-            checkpoints: of the run.
-            manifest: of the state that is gone on from.
-            constants: what the method learned once.
-            runner: whose meter records the time of each checkpoint.
-            tracker: knows the MLflow run's id.
-            needed: returns the older checkpoints that must not be removed yet.
-            path: the checkpoint that is gone on from, which is not written again.
+        `constants` are what the method learned once; `needed` returns the older checkpoints that must not be removed
+        yet.
         """
         self.folder = checkpoints.folder.parent
         """Of the run."""

@@ -53,10 +53,7 @@ def thin_out(demonstrations: Sequence[Demonstration], most: int) -> Thinned:
 def embed(states: Float[np.ndarray, "states obs_dim"], perplexity: float, seed: int) -> Float32[np.ndarray, "states 2"]:
     """Return t-SNE's places of states (van der Maaten and Hinton 2008): near states lie near each other.
 
-    Args:
-        states: each dimension with a scale of its own.
-        perplexity: about how many neighbours count as near; less than the number of states.
-        seed: of what is random in it.
+    The perplexity is about how many neighbours count as near: fewer than there are states.
     """
     from sklearn.manifold import TSNE  # takes a second to import: not for each program that can draw
 

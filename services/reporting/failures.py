@@ -31,9 +31,7 @@ APART = 0.015
 def failures_of_run(finished: FinishedRun, *, videos: bool = False) -> Section:
     """Return the section on the tasks that failed most: their episodes are run again, and drawn step by step.
 
-    Args:
-        finished: the run.
-        videos: film an episode of each task too, into the run's folder ``report/videos``.
+    With `videos` an episode of each task is filmed too, into the run's folder ``report/videos``.
 
     Raises:
         RenderingError: if there is nothing here to film with.

@@ -10,14 +10,7 @@ CARD = "README.md"
 
 
 def model_card(name: str, checkpoint: Checkpoint, summary: Summary, size: int) -> str:
-    """Return the card as Markdown.
-
-    Args:
-        name: of the model.
-        checkpoint: of the run, which the figures are of.
-        summary: of its evaluation.
-        size: bytes of the files that are loaded.
-    """
+    """Return the card of a model as Markdown; `size` is that of the files that are loaded, in bytes."""
     manifest = checkpoint.manifest
     config = manifest.config
     paragraphs = [

@@ -46,10 +46,6 @@ def imitation_error(policy: Policy, demonstrations: Sequence[Demonstration]) -> 
     """Return ‖π(s) − a‖² averaged over all steps: how far a policy is from what was demonstrated, in its states.
 
     What the policy remembers between steps is its own; the states are the demonstrations', whatever it does.
-
-    Args:
-        policy: adapted.
-        demonstrations: at least one.
     """
     total, memory = 0.0, policy.start(len(demonstrations))
     alive = list(demonstrations)
@@ -67,11 +63,8 @@ def plan_adaptations(
 ) -> list[Adaptation]:
     """Return all adaptations of an evaluation, a task's episodes spread over its support sets.
 
-    Args:
-        tasks: with their split.
-        evaluation: how many sets, of what sizes, and how many episodes.
-        held_out: how many demonstrations of a task support sets are drawn from, where there may be too few for
-            `EvaluationConfig.support_draws` disjoint ones: then there are as many as they make.
+    `held_out` has the number of demonstrations that a task's support sets are drawn from. Where they are too few for
+    `EvaluationConfig.support_draws` disjoint ones, there are as many as they make.
     """
 
     def draws(task: str, shots: int) -> int:
@@ -131,17 +124,9 @@ def evaluate_adaptation(
 ) -> AdaptationOutcome:
     """Adapt to a support set and run the episodes that judge it: a pure function of its arguments.
 
-    Args:
-        method: what adapts.
-        parameters: meta-trained.
-        adaptation: which support set and episodes.
-        held_out: demonstrations of the task that meta-training has not seen.
-        envs: of the task, at least one for each episode.
-        horizon: steps in an episode.
-        evaluation: how to adapt.
-        seed: of the experiment; an episode is named by it, the task and the episode's number, so that all shots
-            and methods meet the same episodes.
-        device: what adapts; the policy acts on the CPU.
+    An episode is named by the experiment's seed, the task and its own number, so that all shots and methods meet the
+    same episodes. `held_out` are demonstrations of the task that meta-training has not seen; the device adapts, the
+    policy acts on the CPU.
     """
     support = adaptation.support(held_out)
     policy = adapted_on(device, method, parameters, support, evaluation.fine_tuning)

@@ -105,15 +105,8 @@ def rollout(
 ) -> list[Rollout]:
     """Run one episode for each seed in lockstep: one call of the policy chooses the next action in all of them.
 
-    An episode ends at its first success, or after `horizon` steps without one. Where a policy has diverged, so that
-    an action is not finite, that episode ends there, as a failure, and the others go on.
-
-    Args:
-        policy: adapted to the task.
-        envs: of one task, at least one for each seed.
-        seeds: of the episodes.
-        horizon: steps in an episode.
-        limit: cut the episodes off after so many steps.
+    An episode ends at its first success, or after `horizon` steps without one; a `limit` cuts it off before. Where a
+    policy has diverged, so that an action is not finite, that episode ends there, as a failure, and the others go on.
     """
     steps = horizon if limit is None else limit
     recorders = [_Recorder(env, seed) for env, seed in zip(envs[: len(seeds)], seeds, strict=True)]
@@ -145,13 +138,6 @@ def parallel_episodes(steps: int, horizon: int) -> int:
 def collect_rollouts(policy: Policy, envs: Sequence[Environment], seed: int, steps: int, horizon: int) -> list[Rollout]:
     """Collect so many steps of a policy, in rounds of `parallel_episodes` episodes; the last ones may be cut off.
 
-    Args:
-        policy: what acts.
-        envs: of one task, at least as many as there are parallel episodes.
-        seed: names the episodes.
-        steps: of all episodes together.
-        horizon: of an episode.
-
     Raises:
         FloatingPointError: for an action that is not finite.
     """
@@ -168,17 +154,10 @@ def collect_rollouts(policy: Policy, envs: Sequence[Environment], seed: int, ste
 
 
 def demonstrate(expert: Expert, env: Environment, seed: int, horizon: int, config: DemonstrationConfig) -> Episode:
-    """Run one episode of an expert, until some steps after its first success.
+    """Run one episode of an expert, until some steps after its first success, or to the horizon.
 
     The environment executes the expert's action plus N(0, noise²), as in the authors' code; the action without the
     noise is what is stored unless `config` says otherwise, clipped to the action space as the environment clips it.
-
-    Args:
-        expert: of the task.
-        env: of the task.
-        seed: of the episode.
-        horizon: the attempt is given up after so many steps.
-        config: noise, labels and trailing steps.
     """
     rng = named_rng(seed, "expert noise")
     recorder, end = _Recorder(env, seed), horizon

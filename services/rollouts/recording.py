@@ -96,14 +96,8 @@ def record_rollouts(
     """Run the episodes that `rollout` runs, to the same bits, and record them all.
 
     All episodes of an adaptation have to be run for that: what a network gives for a state may differ in its last bits
-    with the number of states beside it, and so may the whole course of an episode.
-
-    Args:
-        policy: what acts.
-        envs: of one task, one for each seed.
-        seeds: of the episodes.
-        horizon: of an episode.
-        videos: how the episodes are filmed, by their place among the seeds; the others are not.
+    with the number of states beside it, and so may the whole course of an episode. Those are filmed whose place among
+    the seeds `videos` has.
 
     Raises:
         RenderingError: if OpenGL does not work here.

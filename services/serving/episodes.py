@@ -23,14 +23,9 @@ MOST_BYTES = 2**26
 
 
 def played(content: bytes, suite: SuiteConfig, task: str, episode: int, seed: int) -> dict[str, Any]:
-    """Let a policy act in an episode; a process of its own can do that.
+    """Let a policy, as `packed` makes it, act in an episode of its model's run; a process of its own can do that.
 
-    Args:
-        content: the policy, as `packed` makes it.
-        suite: that the task is of.
-        task: the task.
-        episode: its number in an evaluation of the model's run.
-        seed: of that run.
+    The episode is named as in an evaluation, by the run's seed, the task and its number.
 
     Returns:
         The fields of `bodies.Episode`; the film is MP4 in base64, or none, with a note why.

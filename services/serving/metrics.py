@@ -51,12 +51,7 @@ class Metrics:
         }
 
     def text(self, totals: Mapping[tuple[str, tuple[tuple[str, str], ...]], float], **gauges: float) -> bytes:
-        """Return figures in Prometheus' format.
-
-        Args:
-            totals: the sums of all replicas' `samples`.
-            gauges: others, by name.
-        """
+        """Return figures in Prometheus' format: the sums of all replicas' `samples`, and others by name."""
         registry = CollectorRegistry()
         registry.register(_Totals(list(self._registry.collect()), totals, gauges))
         return generate_latest(registry)

@@ -90,11 +90,7 @@ class Service:
     ) -> None:
         """Begin without a policy.
 
-        Args:
-            model: to adapt.
-            shelf: of all replicas.
-            limits: of the service.
-            play: does what `played` does, in another process; a thread of this one if not given.
+        `play` does what `played` does, in another process; a thread of this one if not given.
         """
         self._play = play or functools.partial(asyncio.to_thread, played)
         self.model, self.limits, self.metrics = model, limits, Metrics()

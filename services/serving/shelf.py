@@ -112,9 +112,7 @@ class Shelf:
     async def removals(self, replica: str, since: int) -> Removals:
         """Return what was removed since a version, as soon as anything is; by asking, a replica says what it knows.
 
-        Args:
-            replica: its name.
-            since: the version that it was answered last, 0 at first.
+        The version is the one that it was answered last, 0 at first.
         """
         self._seen[replica] = since, self._clock()
         await self._notify()

@@ -39,14 +39,8 @@ class Holder(BaseModel):
 def held(folder: Path, name: str = LOCK, *, wait: bool = False) -> Iterator[None]:
     """Hold a folder while this process works in it; the end of the process, however it comes, frees it.
 
-    If it is moved away meanwhile, it is not made anew.
-
-    On a file system without locks a warning takes the lock's place.
-
-    Args:
-        folder: it is made if it is not there.
-        name: of the file that is locked in it.
-        wait: for the end of another process that holds it.
+    It is made if it is not there; if it is moved away meanwhile, it is not made anew. On a file system without locks a
+    warning takes the lock's place. With `wait`, the end of another process that holds it is waited for.
 
     Raises:
         DiskFullError: for want of space.

@@ -54,11 +54,9 @@ def private_folder() -> Iterator[Path]:
 
 
 def private_token(folder: Path, warn: Callable[[str], object]) -> Path:
-    """Return the file of a token, which is made if there is none yet, or others could read or replace it.
+    """Return the file ``token`` in a folder, which is made if there is none yet, or others could read or replace it.
 
-    Args:
-        folder: that it lies in, as ``token``; made if it is not there.
-        warn: receives what was open to others.
+    `warn` receives what was open to others.
 
     Raises:
         UserError: if the folder or the token is somebody else's.

@@ -274,13 +274,9 @@ def restored(folder: Path) -> bool:
 def replicated(folder: Path, place: str = RUNS, *, restore: bool = False) -> Iterator[None]:
     """Keep a copy of a run's folder while the run goes on, if ``DMIL_STORAGE`` names a storage.
 
-    A storage that does not answer never stops a run; the copy is brought up to date when it answers again. One
-    warning is logged when the storage fails, one if the copy is not whole at the end.
-
-    Args:
-        folder: of the run.
-        place: the folder of the storage that the copy is in.
-        restore: fetch beforehand what the storage has further.
+    A storage that does not answer never stops a run; the copy is brought up to date when it answers again. One warning
+    is logged when the storage fails, one if the copy is not whole at the end. With `restore`, what the storage has
+    further is fetched beforehand.
 
     Raises:
         UserError: if the URL names no storage.

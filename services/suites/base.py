@@ -99,12 +99,7 @@ def measure_of(suite: TaskSuite, task: str) -> Measure | None:
 
 
 def build_env(suite: TaskSuite, task: str, *, measured: bool = False) -> Environment:
-    """Build a task's environment, and check its spaces.
-
-    Args:
-        suite: of the task.
-        task: one of the suite's.
-        measured: whether the infos of its steps must hold what `measure_of` names.
+    """Build a task's environment, and check its spaces; if `measured`, its infos hold what `measure_of` names.
 
     Raises:
         UserError: if they are not those that the suite names.

@@ -104,12 +104,7 @@ class KitchenTask(gymnasium.Env[np.ndarray, np.ndarray]):
     """
 
     def __init__(self, chain: Sequence[str], start_noise: float = 1.0) -> None:
-        """Build the simulation.
-
-        Args:
-            chain: sub-tasks, keys of `NAMES`.
-            start_noise: how far starts differ, in units of `START_ANGLE` and `START_KETTLE`.
-        """
+        """Build the simulation; `start_noise` is in units of `START_ANGLE` and `START_KETTLE`."""
         self._env = _kitchen_env(chain)
         self.model, self.data = self._env.model, self._env.data
         self._rest = self._env.robot_env.init_qpos
@@ -238,12 +233,7 @@ def sub_tasks_of(task: str, field: str = "task") -> tuple[str, ...]:
 
 
 def replay(demonstration: Demonstration, *, seed: int = 0) -> tuple[str, ...]:
-    """Replay a demonstration's actions open loop from its first state; return the sub-tasks completed on the way.
-
-    Args:
-        demonstration: 30-dimensional states, and actions.
-        seed: of the environment's sensor noise, which acts on the robot too.
-    """
+    """Replay a demonstration's actions open loop from its first state; return the sub-tasks completed on the way."""
     env = KitchenTask(tuple(NAMES))
     _, info = env.reset(seed=seed, options={"state": resting(demonstration.observations[0])})
     for action in demonstration.actions:

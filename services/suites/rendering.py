@@ -49,14 +49,10 @@ class Camera:
         *,
         shadows: bool = True,
     ) -> None:
-        """Look at an environment.
+        """Look at an environment that has MuJoCo's ``model`` and ``data`` in it, and stays as it is.
 
-        Args:
-            env: has MuJoCo's ``model`` and ``data`` in it, and stays as it is.
-            view: one that the model names, in Meta-World for example corner2, or one of one's own.
-            height: of the pictures, in pixels.
-            width: of the pictures.
-            shadows: without them a picture takes a third to an eighth of the time.
+        The view is one that the model names, in Meta-World for example corner2, or one of one's own; height and width
+        are in pixels. Without shadows a picture takes a third to an eighth of the time.
 
         Raises:
             RenderingError: if the model has no such camera, or OpenGL does not work here.

@@ -65,16 +65,11 @@ def tracker_of(sweep: SweepFolder, trial: PlannedTrial, kind: type[Tracker] = Tr
 
 
 def run_trial(folder: Path, name: str, demonstrations: Path, environment: Mapping[str, str]) -> None:
-    """Run a trial to its end, or from where it was stopped, and note what came of it.
+    """Run a trial of the sweep in `folder` to its end, or from where it was stopped, and note what came of it.
 
     An error in it is noted and tracked, and is no failure to Tune, which would only try again. If the process dies,
-    Tune starts it again.
-
-    Args:
-        folder: of the sweep.
-        name: of the trial.
-        demonstrations: root of their store.
-        environment: variables that it has of the sweep's program, as the addresses of MLflow and of a storage.
+    Tune starts it again. `environment` has variables of the sweep's program, as the addresses of MLflow and of a
+    storage.
     """
     torch.set_num_threads(1)
     os.environ |= environment

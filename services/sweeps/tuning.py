@@ -30,12 +30,7 @@ class Progress(Callback):
     """Shows how many trials are over, and how far the others are."""
 
     def __init__(self, sweep: SweepFolder, left: int) -> None:
-        """Show nothing yet: Tune makes a copy of this on disk first.
-
-        Args:
-            sweep: whose trials run.
-            left: how many of them.
-        """
+        """Show nothing yet of the trials that are left: Tune makes a copy of this on disk first."""
         self._sweep, self._left = sweep, left
         self._at: dict[str, int] = {}
         self.held_out: dict[str, tuple[int, float]] = {}

@@ -106,14 +106,7 @@ def check_model(client: "MlflowClient", uri: str, model: "LoggedModel") -> None:
 
 
 def check_run(client: "MlflowClient", uri: str, folder: Path, run_id: str, tag: str) -> None:
-    """Refuse a run that is not the one of a folder, and note in it where that is.
-
-    Args:
-        client: of MLflow.
-        uri: its address.
-        folder: of the run.
-        run_id: that the folder says to have.
-        tag: our own id of the run, by the folder.
+    """Refuse a run that is not the one of a folder, by our own id `tag` of it, and note in it where the folder is.
 
     Raises:
         UserError: if the run has another tag, artifacts in a strange place, or a folder that is still there.

@@ -30,12 +30,7 @@ PROXIED = "mlflow-artifacts:"
 
 
 def server_command(artifacts: Path, port: int) -> list[str]:
-    """Return the command that starts the server on loopback.
-
-    Args:
-        artifacts: the one folder that artifacts are written to.
-        port: to listen on.
-    """
+    """Return the command that starts the server on a port of loopback, with the one folder of its artifacts."""
     return [
         sys.executable, "-m", "mlflow", "server", "--app-name", APP, "--artifacts-destination", str(artifacts),
         "--host", "127.0.0.1", "--port", str(port), "--workers", "1",

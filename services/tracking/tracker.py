@@ -37,12 +37,8 @@ class Tracker:
     def __init__(self, folder: Path, experiment: str, parent: Path | None = None) -> None:
         """Open the MLflow run that belongs to a run's folder, or make one as soon as MLflow answers.
 
-        One warning is logged when MLflow does not take records, one if some are left at the end.
-
-        Args:
-            folder: of the run; a folder that was tracked before continues the same MLflow run.
-            experiment: the MLflow experiment's name.
-            parent: the folder of the sweep that this run is a trial of.
+        One warning is logged when MLflow does not take records, one if some are left at the end. `parent` is the folder
+        of the sweep that this run is a trial of.
 
         Raises:
             UserError: if a record of the run so far is damaged, or the file that says which MLflow run it is, is.
@@ -92,10 +88,7 @@ class Tracker:
     def metrics(self, step: int, values: Mapping[str, float], *, anew: bool = False) -> None:
         """Record metrics of one iteration, but none twice: a resumed run does some iterations again.
 
-        Args:
-            step: the iteration.
-            values: by name.
-            anew: they may have been measured again in another way; those that came out otherwise are recorded too.
+        If they are measured `anew`, those that came out otherwise are recorded too.
         """
         before = {name: self._spool.measured.get(name, {}).get(step) for name in values}
         new = {
@@ -134,22 +127,17 @@ class Tracker:
     def wait_for_run_id(self, timeout: float = 20.0) -> str | None:
         """Return the MLflow run's id, or None if it is not known yet.
 
-        Args:
-            timeout: seconds, counted from the tracker's opening, to wait for it while MLflow neither fails nor is
-                slow; 0 does not wait.
+        It is waited for, up to so many seconds from the tracker's opening, while MLflow neither fails nor is slow.
         """
         while self.run_id is None and not self._troubled() and time.monotonic() < self._opened + timeout:
             time.sleep(0.02)
         return self.run_id
 
     def close(self, status: str, timeout: float = 60.0) -> bool:
-        """End the MLflow run; return whether all records have been delivered, and say so if not.
+        """End the MLflow run as FINISHED, FAILED or KILLED; return whether all records have been delivered.
 
-        It raises nothing, so as not to hide what ended the run.
-
-        Args:
-            status: how the run ended: FINISHED, FAILED or KILLED.
-            timeout: seconds to wait for the delivery while MLflow neither fails nor is slow.
+        It raises nothing, so as not to hide what ended the run. The delivery is waited for, up to so many seconds,
+        while MLflow neither fails nor is slow.
         """
         try:
             self._spool.append("end", Ended.model_validate({"status": status, "time": _now()}))

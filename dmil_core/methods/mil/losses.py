@@ -100,14 +100,9 @@ class Adapted(NamedTuple):
 
 
 def adapted(parameters: Parameters, support: Support, config: MilConfig, tuning: FineTuning, *, keep: bool) -> Adapted:
-    """Take steps down the inner loss.
+    """Take steps down the inner loss on a support set, as `tuning` says.
 
-    Args:
-        parameters: where to begin.
-        support: the steps to learn from.
-        config: of the method.
-        tuning: how many steps, and how long.
-        keep: keep the graph from `parameters`, which then must ask for a gradient; else the result is a leaf.
+    With `keep` the result keeps the graph from `parameters`, which then must ask for a gradient; else it is a leaf.
     """
     fast, first, clipped = dict(parameters), None, 0
     for _ in range(tuning.steps):

@@ -33,14 +33,7 @@ Cache: TypeAlias = tuple[tuple[Float[Tensor, "heads key_units tokens"], Float[Te
 
 
 def initialise(config: MilConfig, obs_dim: int, action_dim: int, rng: np.random.Generator) -> Parameters:
-    """Draw the parameters: uniform weights that keep the variance (LeCun et al. 1998), zero biases, plain norms.
-
-    Args:
-        config: the sizes of all layers, and the scale of the output layer's weights against all others.
-        obs_dim: numbers in an observation.
-        action_dim: numbers in an action.
-        rng: where the weights are drawn from.
-    """
+    """Draw the parameters: uniform weights that keep the variance (LeCun et al. 1998), zero biases, plain norms."""
     generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
     parameters: dict[str, Tensor] = {}
 

@@ -146,15 +146,10 @@ def information_surrogate(
     returns: Float[Tensor, " trajectories"],
     groups: Int[Tensor, " trajectories"],
 ) -> Float[Tensor, ""]:
-    """Return −Cov(log q_ψ(m|τ), R_θ(τ)) over the trajectories of each m; only R_θ has a gradient.
+    """Return −Cov(log q_ψ(m|τ), R_θ(τ)) over the trajectories of each m, by `groups`; only R_θ has a gradient.
 
     If trajectories come from p_θ(τ|m) ∝ p(τ) exp R_θ(τ), then ∇_θ E[log q] = E[log q ∇R] − E[log q] E[∇R], and so this
     has the gradient of −E[log q].
-
-    Args:
-        log_posteriors: log q_ψ(m|τ).
-        returns: R_θ(τ).
-        groups: which m a trajectory belongs to.
     """
     members = functional.one_hot(groups).to(returns.dtype)
     members = members[:, members.any(0)]
@@ -190,13 +185,8 @@ def losses_of(
 ) -> Losses:
     """Return the losses of one task.
 
-    Args:
-        parameters: of the four models.
-        contexts: C trajectories, from each of which one m is inferred.
-        explained: other trajectories of the task, of which number j belongs to m number j mod C.
-        discount: γ in f.
-        negatives: whether the discriminator's negatives have the same m or one of N(0, 1).
-        generator: where m and the policy's actions are drawn from.
+    From each of C trajectories, the `contexts`, one m is inferred; number j of the `explained` ones belongs to m number
+    j mod C. The discriminator's `negatives` have the same m or one of N(0, 1); `discount` is γ in f.
     """
     posterior = infer(parameters, contexts)
     draws = posterior.draw(generator)
