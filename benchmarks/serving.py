@@ -71,7 +71,6 @@ class Client:
     """Asks the service, and counts what comes of it."""
 
     def __init__(self, session: aiohttp.ClientSession) -> None:
-        """Begin with nothing counted."""
         self._session = session
         self.counts: Counter[str] = Counter()
 

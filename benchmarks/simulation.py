@@ -233,7 +233,6 @@ class StockAgent:
     """A policy as Meta-World's evaluation wants it; counts its calls and their seconds."""
 
     def __init__(self, policy: Policy) -> None:
-        """Act as `policy`, one without memory."""
         self._policy = policy
         self.calls, self.seconds = 0, 0.0
 

@@ -110,11 +110,7 @@ class AdaptedPolicy:
         return actions[0] if states.ndim == 1 else actions
 
     def _begin(self, states: Float32[np.ndarray, "..."]) -> None:
-        """Take note of how many episodes there are.
-
-        Raises:
-            UserError: if there were others before, or these are no observations.
-        """
+        """Take note of how many episodes there are, as many as in the steps before."""
         interface = self.origin.interface
         if states.ndim not in (1, 2) or states.shape[-1] != interface.obs_dim or not states.size:
             raise UserError(

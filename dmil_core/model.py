@@ -175,11 +175,7 @@ def model_folder(name: str | Path, runs: str | Path = "runs", field: str = "name
 
 
 def _fetched(scheme: str, address: str) -> Checkpoint:
-    """Return a checkpoint that lies somewhere else.
-
-    Raises:
-        UserError: if nobody knows how to get there.
-    """
+    """Return a checkpoint that lies somewhere else."""
     sources = plug_ins(ENTRY_POINTS, lambda name: None)
     if scheme not in sources:
         raise UserError(

@@ -87,11 +87,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _place_of(data: str) -> str:
-    """Return a data set by its form and place.
-
-    Raises:
-        DemonstrationError: for a file of another kind.
-    """
+    """Return a data set by its form and place."""
     file = at_home(data)
     if data.partition(":")[0] in FORMS:
         return data

@@ -232,12 +232,7 @@ def _check_not_running(folder: Path) -> None:
 
 
 def _token(folder: Path) -> Path:
-    """Return the file of the token, which is made if there is none yet, or others could read or replace it.
-
-    Raises:
-        UserError: if the folder or the token is somebody else's, or the environment has another token, which Ray's
-            programs would use.
-    """
+    """Return the file of the token, made anew if it must be, and no other's in the environment."""
     path = private_token(folder, lambda exposed: console.print(exposed, soft_wrap=True))
     if os.environ.get("RAY_AUTH_TOKEN", (token := read_file(folder, path.name, MOST_BYTES).decode())) != token:
         raise UserError(
@@ -283,11 +278,7 @@ def _check_space(folder: Path, needed: int, remedy: str) -> None:
 
 
 def _wait(server: Server, process: subprocess.Popen[bytes], log: Path, token: str) -> None:
-    """Wait until a server answers.
-
-    Raises:
-        RunError: if it ends before, or does not within two minutes.
-    """
+    """Wait until a server answers."""
     deadline = time.monotonic() + SECONDS_TO_START
     while not _answers(server.url, token):
         if process.poll() is not None or time.monotonic() > deadline:

@@ -79,11 +79,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _start(args: Arguments, digest: str) -> None:
-    """Start the replicas, and wait until all listen.
-
-    Raises:
-        RunError: if one does not.
-    """
+    """Start the replicas, and wait until all listen."""
     import ray
     from ray import serve
 

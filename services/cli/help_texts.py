@@ -67,7 +67,6 @@ class InvalidSettingsError(Exception):
     """Settings that pydantic refuses; tyro would draw a box around its words."""
 
     def __init__(self, error: ValidationError) -> None:
-        """Keep the error."""
         super().__init__(str(error))
         self.error = error
 

@@ -155,7 +155,6 @@ class Strip:
         self._shares = shares
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Fill the width there is."""
         for index, columns in enumerate(_parts(self._shares, options.max_width)):
             colour = colour_of(index)
             # The number again and again, unseen on its own colour: where there are no colours, it tells the parts.

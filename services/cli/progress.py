@@ -123,7 +123,6 @@ class Bar:
         console.print("; ".join(filter(None, parts)))
 
     def __enter__(self) -> "Bar":
-        """Begin to show."""
         if console.live:
             self._live = Live(
                 get_renderable=self._screen, console=console, refresh_per_second=REFRESHES, transient=True
@@ -146,7 +145,6 @@ class Clock:
     """Seconds that each phase took, and all together."""
 
     def __init__(self) -> None:
-        """Start to count."""
         self.seconds: dict[str, float] = {"total": 0.0}
         self._began = self._last = time.perf_counter()
 

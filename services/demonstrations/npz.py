@@ -152,11 +152,7 @@ def episodes_in(
 
 
 def _paired(observations: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Leave out an observation after the last action.
-
-    Raises:
-        DemonstrationError: if there are not as many of both then.
-    """
+    """Leave out an observation after the last action."""
     if len(observations) not in (len(actions), len(actions) + 1):
         raise DemonstrationError(
             f"got {len(observations)} observations for {len(actions)} actions; wanted as many of both, or, of several "

@@ -98,7 +98,6 @@ class DeadlyCallError(RunError):
     """A call during which one worker after the other died; `Pool.retry` sends it again."""
 
     def __init__(self, call: Call) -> None:
-        """Name the call."""
         super().__init__(f"{call.label}: {call.deaths} workers ended in the course of it, one after the other")
         self.call = call
 

@@ -77,15 +77,7 @@ def joined(workers: int | None = None) -> Iterator[None]:
 
 
 def _start(folder: Path, **options: Any) -> None:
-    """Start Ray on this machine, once more if it takes longer than the 30 s that Ray gives itself.
-
-    Args:
-        folder: that it makes for what is its own.
-        options: of `ray.init`.
-
-    Raises:
-        RunError: if it does not come up, as on a machine that is too busy.
-    """
+    """Start Ray in a folder that it makes, once more if it takes longer than the 30 s that Ray gives itself."""
     import ray
 
     for last in (False, True):
@@ -136,11 +128,7 @@ def named_address() -> str | None:
 
 
 def _join(address: str) -> None:
-    """Join a cluster.
-
-    Raises:
-        UserError: if nothing answers there as a Ray of this version, with this token.
-    """
+    """Join a cluster, if a Ray of this version answers there, with this token."""
     import ray
     from ray._private.services import canonicalize_bootstrap_address_or_die  # finds `auto`
     from ray.exceptions import RayError

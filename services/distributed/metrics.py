@@ -126,7 +126,6 @@ class WorkerCounter(PoolListener):
     """Counts the workers of one kind, in one pool or several, and the slots that are computed again."""
 
     def __init__(self, kind: str, meter: Meter) -> None:
-        """Begin with none."""
         self._kind, self._meter = kind, meter
         self._alive = self._lost = 0
         for measure in (WORKERS_JOINED, WORKERS_LOST, WORKERS):

@@ -208,12 +208,7 @@ class RayMetaTraining:
     # Losses
 
     def _result(self, call: Call) -> Any:
-        """Wait for a call's result; where a block kills its workers, find the slot that does it.
-
-        Raises:
-            RunError: names the call that kills its workers.
-            WorkError: names the slot that kills its workers.
-        """
+        """Wait for a call's result; where a block kills its workers, find the slot that does it."""
         while True:
             try:
                 return self._pool.result(call)

@@ -183,7 +183,6 @@ class BackgroundSimulationWorker(SimulationWorker):
     """A simulation worker of low priority."""
 
     def __init__(self, suite: TaskSuite, compute: Compute = USUAL) -> None:
-        """Simulate the tasks of `suite`."""
         os.nice(NICENESS)
         super().__init__(suite, compute)
 
@@ -192,7 +191,6 @@ class RaySimulation(Generic[T]):
     """Work items that one simulation worker runs in the background."""
 
     def __init__(self, pool: "Pool", items: Sequence[WorkItem[T]]) -> None:
-        """Submit the items."""
         self._pool, self._calls = pool, _submit(pool, items)
         self._suspects = set[int]()
 

@@ -131,7 +131,6 @@ class FinishedSimulation(Generic[T]):
     """A simulation that has ended."""
 
     def __init__(self, results: list[T]) -> None:
-        """Hold the results."""
         self._results = results
 
     def done(self) -> bool:
@@ -179,7 +178,6 @@ class LocalMetaTraining:
     """Meta-training in this process, one slot after the other."""
 
     def __init__(self, plan: Plan, compute: Compute = USUAL) -> None:
-        """Start from the plan's state."""
         self._plan, self._next = plan, plan.state.iteration
         device = compute.device if plan.method.on_gpu else "cpu"
         self._learner = Learner(plan.state, plan.settings, skip_nonfinite=plan.skip_nonfinite, device=device)

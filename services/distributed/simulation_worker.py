@@ -41,7 +41,6 @@ class SimulationWorker:
     """Builds environments once and uses them again; an episode depends on its seed alone."""
 
     def __init__(self, suite: TaskSuite, compute: Compute = USUAL) -> None:
-        """Simulate the tasks of `suite`, and adapt to them on a device."""
         torch.set_num_threads(1)
         self.suite, self._compute = suite, compute
         self._envs: dict[str, list[Environment]] = {}

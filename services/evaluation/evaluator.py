@@ -36,7 +36,6 @@ class Tallies:
     """Counts the episodes of an evaluation as they come, by split and size of support set."""
 
     def __init__(self, meter: Meter) -> None:
-        """Count none yet."""
         self._meter = meter
         self._counts: dict[tuple[Split, int], tuple[int, int]] = {}
 

@@ -94,7 +94,6 @@ class CollapseWatch:
     """Notices that one sub-skill takes nearly all states for long, and warns once."""
 
     def __init__(self, method: MethodConfig) -> None:
-        """Start without any iterations."""
         self._method, self._iterations, self._has_warned = method, 0, False
 
     def update(self, iteration: int, metrics: Mapping[str, float]) -> str | None:
@@ -115,7 +114,6 @@ class IterationLog:
     """Tracks the metrics of each iteration, and keeps the recent ones for the screen."""
 
     def __init__(self, runner: Runner, tracker: Tracker, evaluations: Evaluations) -> None:
-        """Start without any iterations."""
         self._runner, self._tracker, self._evaluations = runner, tracker, evaluations
         self._recent: deque[Mapping[str, float]] = deque(maxlen=RECENT)
         self._collapse, self._device = CollapseWatch(evaluations.method), "cpu"

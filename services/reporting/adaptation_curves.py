@@ -186,11 +186,7 @@ def _measure_imitation(run: FinishedRun, runner: Runner, evaluator: Evaluator, f
 
 
 def _plan_of(run: FinishedRun) -> CurvePlan | None:
-    """Return what was measured of the run's newest checkpoint, if anything was.
-
-    Raises:
-        UserError: if the file is not as `measure` writes it.
-    """
+    """Return what was measured of the run's newest checkpoint, if anything was."""
     name = f"{FOLDER}/{PLAN}"
     if not (run.folder / name).exists():
         return None

@@ -29,11 +29,7 @@ def _reset(env: Environment, seed: int) -> object:
 
 
 def _checked(env: Environment, method: str, returned: Any, wanted: tuple[str, ...]) -> Any:
-    """Return what a method of an environment returned, with the observation as an array.
-
-    Raises:
-        UserError: if it is not what `wanted` names, or its observation has not the shape of `observation_space`.
-    """
+    """Return what a method of an environment returned, if it is what was wanted, with the observation as an array."""
     if not isinstance(returned, tuple) or len(returned) != len(wanted):
         got = f"{len(returned)} values" if isinstance(returned, tuple) else f"a {type(returned).__name__}"
         raise UserError(

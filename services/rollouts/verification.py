@@ -51,11 +51,7 @@ def verify(suite: TaskSuite, task: str, seeds: Sequence[int], noise: float) -> l
 
 
 def _check_same(first: Episode, again: Episode, where: str) -> None:
-    """Compare two attempts of one seed.
-
-    Raises:
-        UserError: names the first step after which they differ.
-    """
+    """Compare two attempts of one seed; refuse them by the first step after which they differ."""
     steps = min(len(first.observations), len(again.observations))
     differs = (first.observations[:steps] != again.observations[:steps]).any(axis=1)
     if differs.any() or first.goal != again.goal or len(first) != len(again):

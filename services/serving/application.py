@@ -130,11 +130,7 @@ def _problems(errors: list[Any]) -> list[dict[str, Any]]:
 
 
 async def _body(request: Request, model: type[T]) -> T:
-    """Read a body of JSON.
-
-    Raises:
-        RequestValidationError: names the fields that cannot be used.
-    """
+    """Read a body of JSON."""
     return _validated(await request.body(), model)
 
 
@@ -227,11 +223,7 @@ def _from_json(content: bytes) -> tuple[list[Arrays], Adaptation]:
 
 
 def _array(rows: list[list[float]], *where: str | int) -> np.ndarray:
-    """Return rows as float32; what does not fit becomes infinite.
-
-    Raises:
-        FieldError: names the first row that is longer or shorter than the first one.
-    """
+    """Return rows, which are all as long as the first, as float32; what does not fit becomes infinite."""
     wanted = len(rows[0])
     for index, row in enumerate(rows):
         if len(row) != wanted:

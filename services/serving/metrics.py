@@ -17,7 +17,6 @@ class Metrics:
     """Counters of one replica; `text` also takes those of the others."""
 
     def __init__(self) -> None:
-        """Begin at zero."""
         self._registry = CollectorRegistry()
         self._requests = Counter(
             "dmil_serving_requests", "Requests by route, method and status", ("route", "method", "status"),

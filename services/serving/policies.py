@@ -25,7 +25,6 @@ class FieldError(UserError):
     """Something in a request that cannot be used, with where it is."""
 
     def __init__(self, message: str, *where: str | int) -> None:
-        """Name the fields down to it."""
         super().__init__(message)
         self.where = where
 

@@ -49,7 +49,6 @@ class MissingError(Exception):
     """A policy that is not there."""
 
     def __init__(self, name: str, gone: Gone | None) -> None:
-        """Name it, and why it is gone if it was there."""
         why = "which no demonstrations were posted for" if gone is None else f"gone: {gone.why}"
         super().__init__(f"id: got {shorten(name)}, {why}; wanted one that is there: POST its demonstrations")
         self.gone = gone is not None
@@ -202,11 +201,7 @@ class Service:
         return Posted(_with_expiry(kept), new=True)
 
     def _check(self, recorded: Sequence[Arrays], steps: int) -> None:
-        """See whether shapes and counts are those of the model.
-
-        Raises:
-            FieldError: names the first that is not.
-        """
+        """See whether shapes and counts are those of the model."""
         if len(recorded) > self.limits.demonstrations:
             raise FieldError(
                 f"demonstrations: got {len(recorded)}; wanted at most {self.limits.demonstrations}",

@@ -52,7 +52,6 @@ class Shelf:
     """
 
     def __init__(self, limits: Limits, clock: Callable[[], float] = time.time) -> None:
-        """Begin empty."""
         self._limits, self._clock = limits, clock
         self._kept: OrderedDict[str, Kept] = OrderedDict()
         self._gone: OrderedDict[str, str] = OrderedDict()

@@ -75,11 +75,7 @@ def private_token(folder: Path, warn: Callable[[str], object]) -> Path:
 
 
 def _exposure(path: Path, closed: int) -> str | None:
-    """Return how others can get at a path by its mode bits `closed`, or None.
-
-    Raises:
-        UserError: if it is a link, or somebody else's.
-    """
+    """Return how others can get at a path of one's own by its mode bits `closed`, or None."""
     if not os.path.lexists(path):
         return None
     found = path.lstat()

@@ -216,11 +216,7 @@ def claim_name(folder: Path) -> None:
 
 
 def _answer(ask: Callable[[], T]) -> T:
-    """Return what a storage answers, or raise what it raises.
-
-    Raises:
-        TimeoutError: if it does not answer for `CLAIM_SECONDS`.
-    """
+    """Return what a storage answers, or raise what it raises; it has `CLAIM_SECONDS`."""
     answers, errors = list[T](), list[Exception]()
 
     def work() -> None:

@@ -78,11 +78,7 @@ def find_folder(name: str, runs: Path, mark: str, flag: str = "--resume") -> Pat
 
 
 def _inside_runs(folder: Path, runs: Path, flag: str) -> Path:
-    """Return a folder, unless it seems to lie in `runs` and is a link that leads elsewhere.
-
-    Raises:
-        UserError: then, because whatever is written would be written there.
-    """
+    """Return a folder; refuse a link that leads out of `runs`, where whatever is written would be written."""
     if folder.parent.absolute() == runs.absolute():
         try:
             inside(runs, folder.name)

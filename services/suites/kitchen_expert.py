@@ -247,7 +247,6 @@ class KitchenExpert:
     """Does a chain of sub-tasks."""
 
     def __init__(self, chain: Sequence[str]) -> None:
-        """Do the sub-tasks of `chain`, in the order of `SUB_TASKS`."""
         model = kitchen_model()
         self._arm = Arm(model, "end_effector", JOINTS)
         self._chain = [sub_task for name, sub_task in SUB_TASKS.items() if name in chain]

@@ -74,11 +74,7 @@ def _made(make: Callable[[SuiteConfig], TaskSuite], config: SuiteConfig, where: 
 
 
 def _check_attributes(suite: TaskSuite, where: str) -> None:
-    """Compare what a package made with `TaskSuite`.
-
-    Raises:
-        UserError: names what is missing, or of another kind.
-    """
+    """Compare what a package made with `TaskSuite`."""
     for attribute, kind in ATTRIBUTES.items():
         value = getattr(suite, attribute, None)
         if not isinstance(value, kind) or not value or (isinstance(value, int) and value < 1):
@@ -99,11 +95,7 @@ def _check_attributes(suite: TaskSuite, where: str) -> None:
 def _check_settings(
     make: Callable[[SuiteConfig], TaskSuite], suite: TaskSuite, config: SuiteConfig, where: str
 ) -> None:
-    """Compare a suite with what the settings ask for.
-
-    Raises:
-        UserError: if it ignores a setting, which would then be recorded as though it were in force.
-    """
+    """Refuse a suite that ignores a setting, which would then be recorded as though it were in force."""
     for field in ("train_tasks", "test_tasks", "horizon"):
         if (wanted := getattr(config, field)) is not None and (got := getattr(suite, field)) != wanted:
             raise UserError(f"{where}: {field}: got {got!r}; wanted the {wanted!r} of the settings; see {GUIDE}")

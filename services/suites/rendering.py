@@ -81,11 +81,9 @@ class Camera:
         return (pixels[::-1] if upright else pixels[:, ::-1]).copy()  # OpenGL's first row is the lowest
 
     def __enter__(self) -> "Camera":
-        """Draw."""
         return self
 
     def __exit__(self, *error: object) -> None:
-        """See `close`."""
         self.close()
 
     def close(self) -> None:

@@ -246,11 +246,7 @@ def planned(sweep: Sweep, preset: Preset) -> list[PlannedTrial]:
 
 
 def _only_training_tasks(suite: SuiteConfig) -> None:
-    """Refuse a search that would choose by tasks of meta-testing.
-
-    Raises:
-        UserError: names them.
-    """
+    """Refuse a search that would choose by tasks of meta-testing."""
     whole = open_suite(suite.model_copy(update={"train_tasks": None, "test_tasks": None}))
     held_out = suite.test_tasks or whole.test_tasks
     if wrong := set(held_out) - set(whole.train_tasks):
