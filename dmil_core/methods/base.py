@@ -195,7 +195,6 @@ class Batch(Protocol):
     @property
     def ids(self) -> Sequence[str]:
         """Ids of its demonstrations."""
-        ...
 
 
 @dataclass(frozen=True)

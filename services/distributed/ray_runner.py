@@ -203,7 +203,7 @@ class RaySimulation(Generic[T]):
                 try_again(self._pool, error, self._suspects)
         return all(call.done for call in self._calls)
 
-    def results(self) -> list[T]:
+    def result(self) -> list[T]:
         """Wait for all results and return them in the order of the items."""
         with _naming_deadly_items():
             found = dict(results_tried_again(self._pool, self._calls, self._suspects))

@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from concurrent.futures import Future
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import torch
 
@@ -70,15 +71,12 @@ class MetaTraining(Protocol):
 
     def iterations(self, count: int) -> Iterator[Iteration]:
         """Run the next `count` iterations. No outer step is taken before its iteration is requested."""
-        ...
 
     def state(self) -> OuterState:
         """Return the learner's state after the last whole iteration."""
-        ...
 
     def close(self) -> None:
         """Stop the learner and the adaptation workers."""
-        ...
 
 
 class Simulation(Protocol[ResultOut]):
@@ -86,11 +84,9 @@ class Simulation(Protocol[ResultOut]):
 
     def done(self) -> bool:
         """Return, without waiting, whether all results are there."""
-        ...
 
-    def results(self) -> Sequence[ResultOut]:
+    def result(self) -> Sequence[ResultOut]:
         """Wait for all results and return them in the order of the items."""
-        ...
 
 
 class Runner(Protocol):
@@ -99,47 +95,25 @@ class Runner(Protocol):
     @property
     def meter(self) -> Meter:
         """Records the metrics of the work."""
-        ...
 
     @property
     def worker_counts(self) -> Sequence[Workers]:
         """The workers of each kind that there are beside this process."""
-        ...
 
     def share(self, value: T) -> Callable[[], T]:
         """Return a function that returns `value` in any process; in work items it travels to each node once."""
-        ...
 
     def simulate(self, items: Sequence[WorkItem[T]]) -> Iterator[tuple[int, T]]:
         """Run work items on the simulation workers; yield each index and result as they arrive."""
-        ...
 
     def simulate_in_background(self, items: Sequence[WorkItem[T]]) -> Simulation[T]:
         """Start to run work items beside meta-training; in one process, run them now."""
-        ...
 
     def meta_train(self, plan: Plan) -> MetaTraining:
         """Start the learner and the adaptation workers."""
-        ...
 
     def close(self) -> None:
         """Stop everything that was started."""
-        ...
-
-
-class FinishedSimulation(Generic[T]):
-    """A simulation that has ended."""
-
-    def __init__(self, results: list[T]) -> None:
-        self._results = results
-
-    def done(self) -> bool:
-        """Return true."""
-        return True
-
-    def results(self) -> list[T]:
-        """Return the results."""
-        return self._results
 
 
 class LocalRunner:
@@ -161,9 +135,11 @@ class LocalRunner:
         """Run the items one after the other."""
         return enumerate(map(self._worker.run, items))
 
-    def simulate_in_background(self, items: Sequence[WorkItem[T]]) -> FinishedSimulation[T]:
+    def simulate_in_background(self, items: Sequence[WorkItem[T]]) -> Future[list[T]]:
         """Run the items now."""
-        return FinishedSimulation([self._worker.run(item) for item in items])
+        simulation: Future[list[T]] = Future()
+        simulation.set_result([self._worker.run(item) for item in items])
+        return simulation
 
     def meta_train(self, plan: Plan) -> "LocalMetaTraining":
         """Return the learner with one adaptation worker."""

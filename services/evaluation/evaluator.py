@@ -217,7 +217,7 @@ class Evaluations:
         if self._under_way is not None:
             checkpoint, simulation = self._under_way
             with self._keeping_failures(checkpoint):
-                self._record(checkpoint, simulation.results())
+                self._record(checkpoint, simulation.result())
             self._under_way = None
 
     def _record(self, checkpoint: Checkpoint, outcomes: Sequence[AdaptationOutcome]) -> None:

@@ -388,7 +388,7 @@ def test_checkpoints_wait_for_their_evaluation(workplace: Path, train, monkeypat
         def done(self) -> bool:
             return False
 
-        def results(self) -> list:
+        def result(self) -> list:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(LocalRunner, "simulate_in_background", lambda *given: Never())
