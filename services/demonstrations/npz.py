@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dmil_core.demonstrations import Demonstration, DemonstrationError
+from dmil_core.demonstrations import DemonstrationError
 from dmil_core.errors import shorten
 from dmil_core.files import named, read_file
 
@@ -53,40 +53,22 @@ MOST_HEADER = 2**10
 """Bytes of an array's header; those that numpy writes for these arrays have 128."""
 
 
-def read_npz(path: Path, task: str, obs_dim: int | None = None) -> list[Demonstration]:
-    """Read the demonstrations of one task.
+def read_arrays(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Read observations and actions of each demonstration, whatever numbers are in them.
 
-    Args:
-        path: of the file.
-        task: the task's name.
-        obs_dim: how many of the first columns of ``observations`` to keep, where goals follow the state; all if none.
-
-    Raises:
-        DemonstrationError: names the file, and the array or the demonstration that cannot be used. Archives that
-            unpack to more than is sane are refused before they are unpacked.
-    """
-    try:
-        return [Demonstration(f"{index:03d}", task, *arrays) for index, arrays in enumerate(read_arrays(path, obs_dim))]
-    except DemonstrationError as error:
-        raise DemonstrationError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
-
-
-def read_arrays(path: Path, obs_dim: int | None = None) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Read observations and actions of each demonstration, whatever numbers are in them; see `read_npz`.
+    Archives that unpack to more than is sane are refused before they are unpacked.
 
     Raises:
         DemonstrationError: names the file, and the array that cannot be used.
     """
     try:
-        return arrays_in(read_file(*named(path), MOST_ARCHIVE), obs_dim)
+        return arrays_in(read_file(*named(path), MOST_ARCHIVE))
     except (OSError, DemonstrationError) as error:
         got = str(error) if isinstance(error, DemonstrationError) else _unreadable(error)
         raise DemonstrationError(f"{path}: {got}") from error
 
 
-def arrays_in(
-    content: bytes, obs_dim: int | None = None, most: int = MOST_ARRAYS
-) -> list[tuple[np.ndarray, np.ndarray]]:
+def arrays_in(content: bytes, most: int = MOST_ARRAYS) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return observations and actions of each demonstration in the content of a file, whose arrays have `most` bytes.
 
     Raises:
@@ -95,12 +77,9 @@ def arrays_in(
     try:
         arrays = _read_arrays(content, most)
         episodes = episodes_in(arrays["observations"], arrays["actions"], arrays.get("episode_lengths"))
-        columns = episodes[0][0].shape[1]
-        if obs_dim is not None and not 0 < obs_dim <= columns:
-            raise DemonstrationError(f"observations: got {columns} columns; wanted the first {obs_dim} of them")
         with np.errstate(over="ignore"):  # what does not fit becomes infinite, and is refused
             return [
-                (np.ascontiguousarray(observations[:, :obs_dim], np.float32), np.ascontiguousarray(actions, np.float32))
+                (np.ascontiguousarray(observations, np.float32), np.ascontiguousarray(actions, np.float32))
                 for observations, actions in episodes
             ]
     except DemonstrationError:
@@ -176,7 +155,7 @@ def _read_arrays(content: bytes, most: int) -> dict[str, np.ndarray]:
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         members = archive.infolist()
         _check_members(members, most)
-        return {name: _read_array(archive, member, name) for member in members for name in [_name(member)]}
+        return {_name(member): _read_array(archive, member) for member in members}
 
 
 def _check_end(content: bytes) -> None:
@@ -195,7 +174,7 @@ def _check_members(members: list[zipfile.ZipInfo], most: int) -> None:
     if len(set(names)) != len(names) or not {f"{name}.npy" for name in FORMS.keys() - OPTIONAL} <= set(names) <= wanted:
         raise DemonstrationError(
             f"got the members {shorten(names)}; wanted {', '.join(sorted(wanted))}, each once"
-            f"{renaming([name.removesuffix('.npy') for name in names])}"
+            f"{renaming([*map(_name, members)])}"
         )
     for member in members:
         if member.flag_bits & 1 or member.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
@@ -215,15 +194,10 @@ def _name(member: zipfile.ZipInfo) -> str:
     return member.filename.removesuffix(".npy")
 
 
-def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str) -> np.ndarray:
-    """Return an array, whose header is checked before memory is taken for it.
-
-    Raises:
-        ValueError: if the header is not one of numpy's, or the array would have another size than there is.
-    """
+def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     with archive.open(member) as file:
         content = file.read(member.file_size)  # without a number it would unpack more, and only then cut off
-    return array_in(content, name, *FORMS[name])
+    return array_in(content, _name(member), *FORMS[_name(member)])
 
 
 def array_in(content: bytes, name: str, kinds: str, axes: tuple[int, ...]) -> np.ndarray:

@@ -12,8 +12,8 @@ from random import Random
 import numpy as np
 from mutations import Odd, mutated_bytes
 
-from dmil_core.demonstrations import Demonstration
-from services.demonstrations.npz import read_npz
+from dmil_core.demonstrations import Demonstration, DemonstrationError
+from services.demonstrations.npz import read_arrays
 
 KITCHEN = Path(__file__).parents[3].parent / "shared" / "data" / "kitchen"
 
@@ -123,15 +123,18 @@ class NpzReader:
         return bytes(content)
 
     def read(self) -> list[Demonstration]:
-        return read_npz(self.path, "kitchen", 3)
+        try:
+            return [Demonstration(str(index), "kitchen", *one) for index, one in enumerate(read_arrays(self.path))]
+        except DemonstrationError as error:
+            raise DemonstrationError(f"{self.path}: {error}") from error
 
     def right(self, value: list[Demonstration]) -> bool:
         with np.load(self.path, allow_pickle=False) as arrays:
             if "episode_lengths" not in arrays.files:  # one episode
                 (one,) = value
-                return np.array_equal(one.observations, arrays["observations"][:, :3].astype(np.float32))
+                return np.array_equal(one.observations, arrays["observations"].astype(np.float32))
             ends = np.cumsum(arrays["episode_lengths"])
-            observations = np.split(arrays["observations"][:, :3].astype(np.float32), ends)[:-1]
+            observations = np.split(arrays["observations"].astype(np.float32), ends)[:-1]
             actions = np.split(arrays["actions"].astype(np.float32), ends)[:-1]
         return (
             len(value) == len(ends)
