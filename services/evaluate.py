@@ -201,9 +201,8 @@ def _carry_out(
     from services.reporting.end_of_run import conclude, show
 
     write_file(output, EVALUATED, experiment.config.model_dump_json(indent=1) + "\n")
-    clock, status = Clock(), "FAILED"
-    tracker = Tracker(output, f"dmil-{experiment.config.suite.name}")
-    try:
+    clock = Clock()
+    with Tracker(output, f"dmil-{experiment.config.suite.name}") as tracker:
         record_settings(tracker, experiment.config)
         tracker.tags({"evaluation_of": str(checkpoint.path)})
         with open_runner(args.runner, experiment.suite, args.workers, Compute(args.device), args.gpus) as runner:
@@ -218,12 +217,6 @@ def _carry_out(
             clock.lap("evaluate")
         summary = conclude(evaluation, controls, output, tracker, clock)
         lines = [] if promotion is None else promotion.decide(evaluation, output)
-        status = "FINISHED"
-    except KeyboardInterrupt:
-        status = "KILLED"
-        raise
-    finally:
-        tracker.close(status)
     show(summary, [*tracker.address_lines, *lines])
     return summary
 

@@ -9,7 +9,8 @@ Every setting is a flag; what is not given comes from the YAML file of --config,
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -135,9 +136,7 @@ def _carry_out(args: Arguments, folder: Path, experiment: "Experiment") -> None:
         check_settings(checkpoint, experiment.config, folder / MARK)
     clock = Clock()
     write_file(folder, MARK, config.model_dump_json(indent=1) + "\n")
-    tracker = Tracker(folder, f"dmil-{config.suite.name}")
-    status = "FAILED"
-    try:
+    with Tracker(folder, f"dmil-{config.suite.name}") as tracker, _telling_how_to_go_on(folder, checkpoints):
         record_settings(tracker, config)
         with (
             recording_system(tracker),
@@ -163,16 +162,19 @@ def _carry_out(args: Arguments, folder: Path, experiment: "Experiment") -> None:
         check_folder(folder, MARK)
         summary = conclude(evaluation, controls, folder, tracker, clock)
         tracker.model(trained.path, experiment.held_out_sets(data)[experiment.tasks[-1][1]][:1])
-        status = "FINISHED"
+    show(summary, tracker.address_lines)
+
+
+@contextmanager
+def _telling_how_to_go_on(folder: Path, checkpoints: Checkpoints) -> Iterator[None]:
+    """Where a run is stopped, or fails when it has a checkpoint, print the line that goes on with it."""
+    try:
+        yield
     except BaseException as error:
         stopped = isinstance(error, KeyboardInterrupt)
-        status = "KILLED" if stopped else "FAILED"
         if stopped or (checkpoints.all() and not isinstance(error, UserError)):
             console.print(f"{'stopped; ' if stopped else ''}to go on: {resume_command(folder)}", soft_wrap=True)
         raise
-    finally:
-        tracker.close(status)
-    show(summary, tracker.address_lines)
 
 
 def _read(arguments: Sequence[str]) -> tuple[Arguments, Path]:

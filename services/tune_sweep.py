@@ -81,29 +81,24 @@ def _carry_out(sweep: SweepFolder) -> None:
     from services.sweeps.table_formats import publish, show, write_tables
 
     clock = Clock()
-    tracker = Tracker(sweep.path, f"dmil-{sweep.record.name}")
-    status = "FAILED"
-    try:
-        _record_settings(tracker, sweep)
-        with recording_system(tracker), joined():
-            clock.lap("start")
-            _collect(sweep)
-            clock.lap("collect")
-            tracker.wait_for_run_id()  # trials are its children
-            os.environ |= TUNE_SETTINGS
-            from services.sweeps.tuning import tune_trials  # Tune reads them when it is imported
+    with Tracker(sweep.path, f"dmil-{sweep.record.name}") as tracker:
+        try:
+            _record_settings(tracker, sweep)
+            with recording_system(tracker), joined():
+                clock.lap("start")
+                _collect(sweep)
+                clock.lap("collect")
+                tracker.wait_for_run_id()  # trials are its children
+                os.environ |= TUNE_SETTINGS
+                from services.sweeps.tuning import tune_trials  # Tune reads them when it is imported
 
-            tune_trials(sweep)
-            clock.lap("trials")
-        tables = write_tables(sweep)
-        publish(tracker, tables, sweep)
-        status = "FINISHED"
-    except KeyboardInterrupt:
-        status = "KILLED"
-        console.print(f"stopped; to go on: {resume_command(sweep.path, 'tune-sweep')}", soft_wrap=True)
-        raise
-    finally:
-        tracker.close(status)
+                tune_trials(sweep)
+                clock.lap("trials")
+            tables = write_tables(sweep)
+            publish(tracker, tables, sweep)
+        except KeyboardInterrupt:
+            console.print(f"stopped; to go on: {resume_command(sweep.path, 'tune-sweep')}", soft_wrap=True)
+            raise
     show(tables, sweep)
     console.print("seconds: " + ", ".join(f"{phase} {spent:.0f}" for phase, spent in clock.seconds.items()))
     for line in [*tracker.address_lines, *_side_by_side(sweep)]:

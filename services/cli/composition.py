@@ -102,6 +102,14 @@ def with_evaluation(config: ExperimentConfig, evaluation: EvaluationConfig) -> E
     return checked({**config.model_dump(), "evaluation": evaluation.model_dump()})
 
 
+def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return settings, which are by section, under their whole names, as ``training.iterations``."""
+    named: dict[str, Any] = {}
+    for name, value in settings.items():
+        named |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return named
+
+
 def checked(settings: dict[str, Any], origin: str = "") -> ExperimentConfig:
     """Return the experiment of these settings.
 

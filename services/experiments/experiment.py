@@ -1,6 +1,6 @@
 """One experiment, put together from its config once, for all programs: collect, meta-train, evaluate."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from dmil_core.networks import Parameters, flatten
 from dmil_core.outer_loop import OuterState
 from dmil_core.seeding import named_rng
 from dmil_core.settings import OnNonfinite
+from services.cli.composition import flat
 from services.cli.live_view import Status
 from services.cli.progress import Bar
 from services.demonstrations.collection import DemonstrationCollection
@@ -303,16 +304,8 @@ def changed_settings(before: ExperimentConfig, now: ExperimentConfig) -> dict[st
     """
     both = before.suite.points is not None and now.suite.points is not None
     without = CHANGEABLE if both else CHANGEABLE | {"suite": {"points"}}
-    old, new = (dict(_flat(config.model_dump(exclude=without), "")) for config in (before, now))
+    old, new = (flat(config.model_dump(exclude=without)) for config in (before, now))
     return {key: (old.get(key), new.get(key)) for key in old | new if old.get(key) != new.get(key)}
-
-
-def _flat(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    for key, value in settings.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def _digests(data: Mapping[str, TaskDemonstrations]) -> dict[str, str]:

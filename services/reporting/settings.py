@@ -8,6 +8,7 @@ from pydantic import BaseModel
 
 from dmil_core.configs import BASE_PRESETS, ExperimentConfig, preset_of
 from dmil_core.errors import UserError
+from services.cli.composition import flat
 from services.experiments.finished_run import FinishedRun
 from services.reporting.page import DataTable, Part, Prose, Section
 from services.suites.registry import open_suite
@@ -25,10 +26,10 @@ class Nearest(NamedTuple):
 
 def nearest_preset(config: ExperimentConfig) -> Nearest:
     """Return the preset of a run's own suite and method that is nearest to its settings."""
-    settings = _flat(_as_given(config).model_dump())
+    settings = flat(_as_given(config).model_dump())
     presets = []
     for size in BASE_PRESETS:
-        preset = _flat(preset_of(config.suite.name, size, config.method.name).model_dump())
+        preset = flat(preset_of(config.suite.name, size, config.method.name).model_dump())
         differing = {name: value for name, value in settings.items() if name not in preset or preset[name] != value}
         presets.append(Nearest(size, preset, differing))
     return min(presets, key=lambda nearest: len(nearest.differing))
@@ -58,13 +59,6 @@ def _flag(name: str, value: Any) -> list[str]:
     return [f"--{section}{dot}{field}", *map(str, values)]
 
 
-def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat = {}
-    for name, value in settings.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
-    return flat
-
-
 def settings_of_run(finished: FinishedRun) -> Section:
     """Return the section with all settings, those that differ from the nearest preset's apart."""
     config = finished.config
@@ -76,7 +70,7 @@ def settings_of_run(finished: FinishedRun) -> Section:
         if differing
         else f"All settings are those of the preset {name}."
     )
-    others = {name: value for name, value in _flat(config.model_dump()).items() if name not in differing}
+    others = {name: value for name, value in flat(config.model_dump()).items() if name not in differing}
     changed = [[n, _text(v), _text(preset.get(n)), meanings.get(n, "")] for n, v in differing.items()]
     same = [[n, _text(v), meanings.get(n, "")] for n, v in others.items()]
     parts: list[Part] = [Prose(text)]

@@ -3,13 +3,14 @@
 import logging
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from dmil_core.configs import ExperimentConfig
 from dmil_core.demonstrations import Demonstration
 from dmil_core.errors import RunError
+from services.cli.composition import flat
 from services.storage.provenance import git_commit, library_versions
 from services.storage.redaction import error_line, redacted
 from services.tracking.delivery import Delivery, Identity
@@ -32,7 +33,7 @@ CLOSING_SECONDS = 3.0
 
 
 class Tracker:
-    """One MLflow run, fed from ``tracking.jsonl`` in the run's folder."""
+    """One MLflow run, fed from ``tracking.jsonl`` in the run's folder; in a ``with`` it ends as what goes on inside."""
 
     def __init__(self, folder: Path, experiment: str, parent: Path | None = None) -> None:
         """Open the MLflow run that belongs to a run's folder, or make one as soon as MLflow answers.
@@ -57,6 +58,13 @@ class Tracker:
         self._thread = threading.Thread(target=self._work, name="mlflow", daemon=True)
         self._spool.append("begin", None)
         self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
+        stopped = kind is not None and issubclass(kind, KeyboardInterrupt)
+        self.close("FINISHED" if kind is None else "KILLED" if stopped else "FAILED")
 
     @property
     def run_id(self) -> str | None:
@@ -188,18 +196,10 @@ class Tracker:
 
 def record_settings(tracker: Tracker, config: ExperimentConfig) -> None:
     """Record what a run is: every setting, the commit of the code and the versions of the libraries."""
-    tracker.parameters(dict(_flat(config.model_dump(mode="json"), "")))
+    tracker.parameters(flat(config.model_dump(mode="json")))
     tracker.tags({"suite": config.suite.name, "method": config.method.name, "seed": str(config.seed)})
     tracker.tags({"shots": " ".join(map(str, config.evaluation.shots))})
     tracker.tags({"git_commit": git_commit(), **{f"version.{name}": v for name, v in library_versions().items()}})
-
-
-def _flat(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    for name, value in settings.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def _now() -> int:
