@@ -1,6 +1,5 @@
 """A policy adapted to one task, as whoever moves a robot uses it: called step by step, saved to a folder, loaded."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,11 +9,9 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Int64
 from pydantic import BaseModel, ConfigDict, Field
-from safetensors.numpy import save
 from torch import Tensor
 
-from dmil_core.checkpoint import CONSTANTS, MOST_TENSORS, Manifest, damaged, read_sealed, read_tensors
-from dmil_core.checksums import listing, sha256
+from dmil_core.checkpoint import CONSTANTS, MOST_TENSORS, Manifest, damaged, packed, read_sealed, read_tensors, sealed
 from dmil_core.demonstrations import Demonstration, DemonstrationError
 from dmil_core.errors import RunError, UserError, shorten
 from dmil_core.files import create_file, making_folder, room_for
@@ -157,10 +154,6 @@ class AdaptedPolicy:
             for field in ("observations", "actions")
         }
         contents = {TENSORS: _stored(tensors_of(self.policy)), CONSTANTS: origin.constants, DEMONSTRATIONS: support}
-        files = {
-            name: save({key: np.ascontiguousarray(array) for key, array in tensors.items()})
-            for name, tensors in contents.items()
-        }
         source = Source(
             model=origin.model,
             fine_tuning_steps=origin.fine_tuning.steps,
@@ -168,10 +161,8 @@ class AdaptedPolicy:
             optimiser=origin.fine_tuning.optimiser,
             displaced=origin.fine_tuning.displaced,
             demonstrations=tuple((one.task, one.id) for one in self.support),
-            files={name: sha256(content) for name, content in files.items()},
         )
-        text = json.dumps(source.model_dump(mode="json"), indent=1).encode()
-        files |= {POLICY: text, SEAL: listing({POLICY: sha256(text)}).encode()}
+        files = sealed({name: packed(tensors) for name, tensors in contents.items()}, source, POLICY, SEAL)
         if path.exists():
             raise UserError(f"folder: got {path}, which is there already; wanted a new name")
         with room_for(path, sum(map(len, files.values()))), making_folder(path.parent, path.name) as made:

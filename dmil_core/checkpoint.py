@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, field_validator, model_validator
 from safetensors import SafetensorError
-from safetensors.numpy import load
+from safetensors.numpy import load, save
 
 from dmil_core.checksums import checked_file, listing, sha256
 from dmil_core.configs import ExperimentConfig
@@ -273,6 +273,21 @@ def read_sealed(folder: Path, name: str, marker: str, most: int, model: type[Mod
     except (OSError, ValidationError) as error:
         got = _describe(error) if isinstance(error, OSError) else describe_errors(error, "manifest", "; ")
         raise damaged(folder / name, got, "a checkpoint's manifest") from error
+
+
+def packed(tensors: Mapping[str, np.ndarray]) -> bytes:
+    """Return tensors as the content of a file of safetensors."""
+    return save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
+
+
+def sealed(files: Mapping[str, bytes], description: BaseModel, name: str, marker: str) -> dict[str, bytes]:
+    """Return files of tensors, with the JSON file `name` that has their digests, and the `marker` that has its own.
+
+    `read_sealed` reads it: a description with a field ``files``.
+    """
+    digests = {file: sha256(content) for file, content in files.items()}
+    text = json.dumps({**description.model_dump(mode="json"), "files": digests}, indent=1).encode()
+    return {**files, name: text, marker: listing({name: sha256(text)}).encode()}
 
 
 def checkpoints_in(folder: Path) -> list[Path]:

@@ -5,7 +5,6 @@ The learner's state stays behind, so nobody can go on with its meta-training. Fo
   python -m services.export ml10-0 models/ml10
 """
 
-import json
 import shlex
 import sys
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from dmil_core.checksums import checked_file, listing, sha256
+from dmil_core.checksums import checked_file
 from dmil_core.errors import UserError
 from dmil_core.files import create_file, making_folder, read_json
 from services.cli.arguments import exit_code, parse
@@ -86,16 +85,12 @@ def _figures(checkpoint: "Checkpoint", folder: Path) -> "Summary":
 
 def _files(checkpoint: "Checkpoint") -> dict[str, bytes]:
     """Return the files of a checkpoint by name, without the optimiser's."""
-    from dmil_core.checkpoint import CONSTANTS, MANIFEST, MARKER, MOST_CONSTANTS, MOST_TENSORS, PARAMETERS
+    from dmil_core.checkpoint import CONSTANTS, FILES, MANIFEST, MARKER, PARAMETERS, sealed
 
     manifest = checkpoint.manifest
-    most = {PARAMETERS: MOST_TENSORS, CONSTANTS: MOST_CONSTANTS}
-    files = {name: checked_file(checkpoint.path, name, manifest.files[name], most[name]) for name in most}
-    shipped = manifest.model_copy(
-        update={"files": {name: manifest.files[name] for name in files}, "mlflow_run_id": None}
-    )
-    text = json.dumps(shipped.model_dump(mode="json"), indent=1).encode()
-    return files | {MANIFEST: text, MARKER: listing({MANIFEST: sha256(text)}).encode()}
+    kept = PARAMETERS, CONSTANTS
+    files = {name: checked_file(checkpoint.path, name, manifest.files[name], FILES[name]) for name in kept}
+    return sealed(files, manifest.model_copy(update={"mlflow_run_id": None}), MANIFEST, MARKER)
 
 
 if __name__ == "__main__":

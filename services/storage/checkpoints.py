@@ -1,6 +1,5 @@
 """The checkpoints of a run: written whole or not at all, the newest and the best of them kept."""
 
-import json
 import logging
 import math
 from collections.abc import Collection, Mapping
@@ -8,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.numpy import save
 
 from dmil_core.checkpoint import (
     CONSTANTS,
@@ -24,9 +22,10 @@ from dmil_core.checkpoint import (
     iteration_of,
     newest,
     newest_whole,
+    packed,
     read_manifest,
+    sealed,
 )
-from dmil_core.checksums import listing, sha256
 from dmil_core.files import create_file, making_folder, remove_abandoned, remove_folder, room_for
 from dmil_core.networks import unflatten
 from dmil_core.outer_loop import OuterState
@@ -78,13 +77,7 @@ class Checkpoints:
             OPTIMISER: {"first_moment": state.first_moment, "second_moment": state.second_moment},
             CONSTANTS: constants,
         }
-        files = {
-            name: save({key: np.ascontiguousarray(value) for key, value in tensors.items()})
-            for name, tensors in contents.items()
-        }
-        digests = {name: sha256(content) for name, content in files.items()}
-        text = json.dumps({**manifest.model_dump(mode="json"), "files": digests}, indent=1).encode()
-        files |= {MANIFEST: text, MARKER: listing({MANIFEST: sha256(text)}).encode()}
+        files = sealed({name: packed(of) for name, of in contents.items()}, manifest, MANIFEST, MARKER)
         run, place = self.folder.parent, self.folder.name
         remove_abandoned(run, place)
         with (
