@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from dmil_core.files import write_file
+from dmil_core.trajectories import Rollout
 from services.reporting.drawing import colour_of
 from services.rollouts.recording import Frame, VideoSettings
 from services.suites.rendering import View
@@ -61,6 +62,14 @@ class Side(NamedTuple):
     def acting(self, step: int) -> int | None:
         """Return the sub-skill whose action led to the state after so many steps."""
         return self.sub_skills[max(step - 1, 0)] if self.sub_skills else None
+
+
+def filmed(title: str, episode: Rollout, frames: Sequence[Frame], best_score: int, sub_skills: int) -> Side:
+    """Return an episode of a policy with K sub-skills as a film shows it, in a suite whose `best_score` is known."""
+    score = f": {episode.score} of {best_score} sub-tasks" if best_score > 1 else ""
+    ending = f"{'solved' if episode.success else 'not solved'} in {len(episode)} steps{score}"
+    acting = episode.sub_skills.tolist() if sub_skills > 1 else None
+    return Side(title, frames, len(episode), acting, episode.success, ending)
 
 
 def video_settings(view: str | View, steps: int, form: Form) -> VideoSettings:

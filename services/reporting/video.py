@@ -5,7 +5,7 @@ from dmil_core.settings import sub_skills_of
 from services.evaluation.results import EpisodeResult
 from services.experiments.finished_run import FinishedRun
 from services.experiments.replay import ReplayedEpisode
-from services.reporting.film import Side
+from services.reporting.film import Side, filmed
 from services.suites.rendering import View
 
 
@@ -36,10 +36,7 @@ def camera_of(finished: FinishedRun) -> str | View:
 
 
 def side_of(finished: FinishedRun, replayed: ReplayedEpisode) -> Side:
-    """Return an episode as a film shows it."""
-    episode, row = replayed.rollout, replayed.row
+    """Return an episode of a run as a film shows it."""
+    row, best, sub_skills = replayed.row, finished.experiment.suite.best_score, sub_skills_of(finished.config.method)
     title = f"{row.task}, {row.shots}-shot, episode {row.episode}"
-    score = f": {episode.score} of {best} sub-tasks" if (best := finished.experiment.suite.best_score) > 1 else ""
-    ending = f"{'solved' if episode.success else 'not solved'} in {len(episode)} steps{score}"
-    sub_skills = episode.sub_skills.tolist() if sub_skills_of(finished.config.method) > 1 else None
-    return Side(title, replayed.recording.frames, len(episode), sub_skills, episode.success, ending)
+    return filmed(title, replayed.rollout, replayed.recording.frames, best, sub_skills)

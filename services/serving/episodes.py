@@ -11,7 +11,7 @@ from dmil_core.configs import SuiteConfig
 from dmil_core.files import read_file
 from dmil_core.seeding import named_seed
 from dmil_core.settings import sub_skills_of
-from services.reporting.film import FORMS, Side, video_settings, write_film
+from services.reporting.film import FORMS, filmed, video_settings, write_film
 from services.rollouts.recording import record_rollouts
 from services.serving.packing import unpacked
 from services.suites.base import build_env
@@ -43,12 +43,8 @@ def played(content: bytes, suite: SuiteConfig, task: str, episode: int, seed: in
     sub_skills = rollout.sub_skills.tolist()
     answer = {"success": rollout.success, "steps": len(rollout), "sub_skills": sub_skills, "video": None, "note": note}
     if recording.frames:
-        ending = f"{'solved' if rollout.success else 'not solved'} in {len(rollout)} steps"
-        several = sub_skills_of(policy.origin.model.config.method) > 1
-        side = Side(
-            f"{task}, episode {episode}", recording.frames, len(rollout), sub_skills if several else None,
-            rollout.success, ending,
-        )  # fmt: skip
+        count = sub_skills_of(policy.origin.model.config.method)
+        side = filmed(f"{task}, episode {episode}", rollout, recording.frames, opened.best_score, count)
         with tempfile.TemporaryDirectory() as made:
             write_film(Path(made) / "film.mp4", [side])
             answer["video"] = base64.b64encode(read_file(Path(made), "film.mp4", MOST_BYTES)).decode()
