@@ -23,7 +23,7 @@ from dmil_core.errors import UserError
 from dmil_core.seeding import named_rng
 from dmil_core.statistics import interquartile_mean, mean_score, stratified_bootstrap, success_rate
 from services.evaluation.paper_results import Published
-from services.evaluation.results import EpisodeResult, EvaluationFolder, Metric
+from services.evaluation.results import EpisodeResult, EvaluationFolder, Metric, grouped
 from services.evaluation.summary import sub_skill_shares
 from services.suites.base import Split
 from services.tracking.history import read_metrics
@@ -168,9 +168,7 @@ class Comparison:
         """
         outcomes: dict[CellKey, dict[int, SeedOutcomes]] = defaultdict(dict)
         for evaluation in self.evaluations:
-            groups: dict[tuple[Split, int], list[EpisodeResult]] = defaultdict(list)
-            for episode in evaluation.measured.episodes:
-                groups[episode.split, episode.shots].append(episode)
+            groups = grouped(evaluation.measured.episodes, lambda episode: (episode.split, episode.shots))
             for (split, shots), group in groups.items():
                 seeds = outcomes[CellKey(evaluation.row, evaluation.suite, split, shots)]
                 seeds[evaluation.seed] = outcome = _seed_outcomes(group, self.metric, evaluation)
@@ -231,9 +229,7 @@ class Comparison:
 
 
 def _seed_outcomes(rows: Sequence[EpisodeResult], metric: Metric, evaluation: SeedEvaluation) -> SeedOutcomes:
-    by_task: dict[str, list[EpisodeResult]] = defaultdict(list)
-    for row in sorted(rows, key=lambda row: (row.task, row.episode)):
-        by_task[row.task].append(row)
+    by_task = grouped(sorted(rows, key=lambda row: (row.task, row.episode)), lambda row: row.task)
     counts = tuple(len(of_task) for of_task in by_task.values())
     if len(set(counts)) > 1:
         raise _other_episodes(evaluation, counts)

@@ -1,6 +1,6 @@
 """Rows of results: one an episode, one an adaptation, with all that is needed to run them again."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +14,7 @@ from dmil_core.settings import Optimiser
 from services.suites.base import Split
 
 Row = TypeVar("Row", bound=BaseModel)
+Key = TypeVar("Key", bound=Hashable)
 MOST_BYTES = 2**30
 """In a file of rows."""
 LONGEST_LINE = 2**20
@@ -92,6 +93,14 @@ class ImitationResult(_Row):
     """On the demonstrations that it was adapted to."""
     held_out_error: float | None
     """On held-out ones that it was not adapted to, where there are any."""
+
+
+def grouped(rows: Iterable[Row], by: Callable[[Row], Key]) -> dict[Key, list[Row]]:
+    """Return rows by what a function says of each, in their order."""
+    groups: dict[Key, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(by(row), []).append(row)
+    return groups
 
 
 def write_rows(path: Path, rows: Iterable[BaseModel]) -> None:

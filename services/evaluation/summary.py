@@ -1,8 +1,6 @@
 """From result rows to the table that a run ends with."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import groupby
-from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +15,7 @@ from dmil_core.statistics import interval_text, mean_score, share_entropy, succe
 from services.cli.escapes import for_markdown
 from services.evaluation.controls import HEAD, ControlRow, said
 from services.evaluation.paper_results import Published, figure_of
-from services.evaluation.results import AdaptationResult, EpisodeResult
+from services.evaluation.results import AdaptationResult, EpisodeResult, grouped
 from services.suites.base import Split
 
 BEST = 5
@@ -158,14 +156,12 @@ def summary_rows(episodes: Sequence[EpisodeResult], best_score: int, method: Met
 
     Where the score of an episode in which all is done is more than 1, scores are given too.
     """
-    key = attrgetter("suite", "split", "shots")
     rows = []
     sound = [row for row in episodes if row.fault is None]
-    for (suite, split, shots), group in groupby(sorted(sound, key=key), key=key):
-        of_group = list(group)
+    for (suite, split, shots), of_group in grouped(sound, lambda row: (row.suite, row.split, row.shots)).items():
         rate = success_rate([row.success for row in of_group])
-        tasks = dict.fromkeys(row.task for row in of_group)
-        per_task = {task: float(np.mean([row.success for row in of_group if row.task == task])) for task in tasks}
+        by_task = grouped(of_group, lambda row: row.task)
+        per_task = {task: float(np.mean([row.success for row in of_task])) for task, of_task in by_task.items()}
         rows.append(
             SummaryRow(
                 suite=suite,
@@ -187,9 +183,7 @@ def summary_rows(episodes: Sequence[EpisodeResult], best_score: int, method: Met
 def _score(rows: Sequence[EpisodeResult], best: int) -> Score:
     mean = mean_score([float(row.score) for row in rows])
     spread = {"deviation": mean.deviation, "low": mean.low, "high": mean.high}
-    by_task: dict[str, list[int]] = {}
-    for row in rows:
-        by_task.setdefault(row.task, []).append(row.score)
+    by_task = {task: [row.score for row in of_task] for task, of_task in grouped(rows, lambda row: row.task).items()}
     return Score(
         best=best,
         mean=mean.mean,

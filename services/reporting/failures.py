@@ -1,7 +1,6 @@
 """What failed: all episodes of the worst tasks once more, by how far each has come at every step."""
 
-from collections import defaultdict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dmil_core.files import inside
-from services.evaluation.results import EpisodeResult
+from services.evaluation.results import EpisodeResult, grouped
 from services.experiments.finished_run import REPORT, FinishedRun
 from services.experiments.replay import Replay, ReplayedEpisode, ReplayError, replaying
 from services.reporting.drawing import Picture, colour_of, panels, to_picture
@@ -67,19 +66,12 @@ def worst_tasks(episodes: Sequence[EpisodeResult]) -> list[list[EpisodeResult]]:
 
     Tasks of meta-testing, which the run is for, come before the others; those in which nothing failed are left out.
     """
-    failed = [rows for rows in _grouped(episodes, lambda row: (row.split, row.task)) if _rate(rows) < 1]
+    failed = [rows for rows in grouped(episodes, lambda row: (row.split, row.task)).values() if _rate(rows) < 1]
     failed.sort(key=lambda rows: (rows[0].split != "meta-testing", _rate(rows)))
     return [
-        min(_grouped(rows, lambda row: row.shots), key=lambda of: (_rate(of), of[0].shots))
+        min(grouped(rows, lambda row: row.shots).values(), key=lambda of: (_rate(of), of[0].shots))
         for rows in failed[:MOST_TASKS]
     ]
-
-
-def _grouped(rows: Sequence[EpisodeResult], by: Callable[[EpisodeResult], Hashable]) -> list[list[EpisodeResult]]:
-    groups: dict[Hashable, list[EpisodeResult]] = defaultdict(list)
-    for row in rows:
-        groups[by(row)].append(row)
-    return list(groups.values())
 
 
 def _rate(rows: Sequence[EpisodeResult]) -> float:
@@ -91,7 +83,7 @@ def _of_task(
 ) -> tuple[list[Part], list[list[str | int | float]]]:
     """Return what the page shows of a task, and a line of the table for each episode."""
     run, task = replay.run, rows[0].task
-    adaptations = sorted(_grouped(rows, lambda row: row.draw), key=_rate)
+    adaptations = sorted(grouped(rows, lambda row: row.draw).values(), key=_rate)
     filmed = next(row for row in adaptations[0] if not row.success)
     replayed = _run_again(replay, adaptations, filmed if videos else None)
     measure = measure_of(run.experiment.suite, task)

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 
 from dmil_core.statistics import Mean, interval_text, mean_score, success_rate
 from services.evaluation.controls import HEAD, said
-from services.evaluation.results import EpisodeResult
+from services.evaluation.results import EpisodeResult, grouped
 from services.evaluation.summary import against_collapse, described, diverged_of, headline
 from services.experiments.finished_run import FinishedRun
 from services.reporting.drawing import INK, Picture, colour_of, panels, to_picture
@@ -21,9 +21,8 @@ INCHES_A_TASK = 0.22
 
 def estimates(episodes: Sequence[EpisodeResult], *, scores: bool) -> dict[tuple[Split, int, str], Mean]:
     """Return the success rate, with Wilson's interval, by split, shots and task; of scores the mean with Student's."""
-    groups: dict[tuple[Split, int, str], list[EpisodeResult]] = defaultdict(list)
-    for row in (row for row in episodes if row.fault is None):
-        groups[row.split, row.shots, row.task].append(row)
+    sound = [row for row in episodes if row.fault is None]
+    groups = grouped(sound, lambda row: (row.split, row.shots, row.task))
     if scores:
         return {key: mean_score([float(row.score) for row in rows]) for key, rows in groups.items()}
     return {key: success_rate([row.success for row in rows]) for key, rows in groups.items()}
