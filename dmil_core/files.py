@@ -369,9 +369,11 @@ def read_json(root: Path, name: Name, model: type[Model], most: int, advice: str
     """Read a JSON file of at most `most` bytes below a folder into a model of pydantic's.
 
     Raises:
-        UserError: names the file and what is wrong in it, with `advice`: what was wanted and what to do.
+        UserError: names the file, and what is wrong with it or in it, with `advice`: what was wanted and what to do.
     """
     try:
         return model.model_validate_json(read_file(root, name, most))
-    except ValidationError as error:
-        raise UserError(f"{root / name}: got {describe_errors(error, separator='; ')}; {advice}") from error
+    except (OSError, ValidationError) as error:
+        wrong = isinstance(error, ValidationError)
+        got = describe_errors(error, separator="; ") if wrong else error.strerror or str(error)
+        raise UserError(f"{root / name}: got {got}; {advice}") from error

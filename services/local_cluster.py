@@ -20,10 +20,10 @@ from urllib.request import ProxyHandler, Request, build_opener, getproxies, prox
 
 import psutil
 import tyro
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
-from dmil_core.errors import RunError, UserError, describe_errors
-from dmil_core.files import append_to, read_file, write_file
+from dmil_core.errors import RunError, UserError
+from dmil_core.files import append_to, read_file, read_json, write_file
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.distributed.node_info import usable_cpus
@@ -121,17 +121,10 @@ class Record(BaseModel):
         Raises:
             UserError: if it is damaged.
         """
-        path = folder / "cluster.json"
-        if not path.exists():
+        if not (folder / "cluster.json").exists():
             return None
-        try:
-            return Record.model_validate_json(read_file(folder, path.name, MOST_BYTES))
-        except (OSError, ValidationError) as error:
-            got = describe_errors(error) if isinstance(error, ValidationError) else str(error)
-            raise UserError(
-                f"{path}: got {'; '.join(got.splitlines())}; wanted the note of what was started; look for it with "
-                "`ps`, end it, and remove the file"
-            ) from error
+        advice = "wanted the note of what was started; look for it with `ps`, end it, and remove the file"
+        return read_json(folder, "cluster.json", Record, MOST_BYTES, advice)
 
 
 class Server(NamedTuple):

@@ -1,7 +1,4 @@
-"""What a run shows at its end, on the terminal and as tables; its page is `reporting.run_report`'s.
-
-As a program it draws what there is to look at: ``python -m services.report gallery``.
-"""
+"""Draw what there is to look at, or lay tables out: ``dmil report gallery``."""
 
 import sys
 from collections.abc import Sequence
@@ -9,18 +6,8 @@ from importlib import import_module
 
 from dmil_core.errors import UserError, nearest
 from services.cli.arguments import exit_code
-from services.cli.help_texts import command_of
+from services.cli.help_texts import REPORTS, command_of
 from services.cli.progress import console
-
-KINDS = {
-    "run": "services.report_run",
-    "compare": "services.report_compare",
-    "sub-skills": "services.report_sub_skills",
-    "video": "services.report_video",
-    "gallery": "services.report_gallery",
-    "tables": "services.report_tables",
-}
-"""What the program draws, and the module that does."""
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -31,15 +18,16 @@ def run(arguments: Sequence[str]) -> None:
     """
     if arguments and arguments[0] in {"--help", "-h"}:
         console.print(f"usage: {command_of('services.report')} KIND [--help]\n")
-        for kind, module in KINDS.items():
+        for kind, module in REPORTS.items():
             console.print(f"  {kind:12}{(import_module(module).__doc__ or '').splitlines()[0]}")
         return
-    if not arguments or arguments[0] not in KINDS:
+    if not arguments or arguments[0] not in REPORTS:
         got = arguments[0] if arguments else "nothing"
         raise UserError(
-            f"report: got {got}; wanted one of {', '.join(KINDS)}, each with a --help of its own{nearest(got, KINDS)}"
+            f"report: got {got}; wanted one of {', '.join(REPORTS)}, each with a --help of its own"
+            f"{nearest(got, REPORTS)}"
         )
-    import_module(KINDS[arguments[0]]).run(arguments[1:])
+    import_module(REPORTS[arguments[0]]).run(arguments[1:])
 
 
 if __name__ == "__main__":

@@ -11,17 +11,17 @@ from tyro.constructors import ConstructorRegistry, StructConstructorSpec, Struct
 
 from dmil_core.errors import describe_errors
 
+REPORTS = {
+    kind: f"services.report_{kind.replace('-', '_')}"
+    for kind in ("run", "compare", "sub-skills", "video", "gallery", "tables")
+}
+"""What the program ``report`` draws, and the module that does."""
 COMMANDS = {
     "services.inspect_demos": "services.collect_demos inspect",
     "services.record_demos": "services.collect_demos record",
     "services.verify_experts": "services.collect_demos verify",
-    "services.report_run": "services.report run",
-    "services.report_compare": "services.report compare",
-    "services.report_sub_skills": "services.report sub-skills",
-    "services.report_video": "services.report video",
-    "services.report_gallery": "services.report gallery",
-    "services.report_tables": "services.report tables",
     "services.tracking.__main__": "services.tracking",
+    **{module: f"services.report {kind}" for kind, module in REPORTS.items()},
 }
 """How modules are called that are no program of their own name."""
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from dmil_core.files import read_file, write_file
 from services.reporting.drawing import Picture
@@ -95,19 +95,19 @@ class Section:
         object.__setattr__(self, "id", "-".join(words))
 
 
+def templates_of(*packages: str) -> Environment:
+    """Return the templates of some packages; the first one's come first."""
+    loader = ChoiceLoader([PackageLoader(package) for package in packages])
+    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+
+
 def write_page(path: Path, title: str, lead: Sequence[Part], sections: Sequence[Section]) -> None:
     """Write a page, the lead above all sections; those without parts are left out, and titles differ.
 
     Raises:
         DiskFullError: for want of space; the file is then what it was.
     """
-    templates = Environment(
-        loader=PackageLoader("services.reporting"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    templates = templates_of("services.reporting")
     templates.filters["kind"] = lambda part: type(part).__name__
     kept = [section for section in sections if section.parts]
     page = templates.get_template("page.html").render(

@@ -1,8 +1,7 @@
 """The page of the service: one file that holds nothing of the service and asks for all with the token."""
 
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
-
 from services.cli.colours import COLOURS
+from services.reporting.page import templates_of
 
 HEADERS = {
     "content-security-policy": (
@@ -17,11 +16,4 @@ HEADERS = {
 
 def page() -> str:
     """Return the page, in the style of a run's."""
-    templates = Environment(
-        loader=ChoiceLoader([PackageLoader("services.serving"), PackageLoader("services.reporting")]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return templates.get_template("service.html").render(colours=COLOURS)
+    return templates_of("services.serving", "services.reporting").get_template("service.html").render(colours=COLOURS)

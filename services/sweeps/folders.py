@@ -12,19 +12,18 @@ from collections.abc import Mapping, Sequence
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
 from dmil_core.checksums import sha256
 from dmil_core.configs import EvaluationConfig, ExperimentConfig
-from dmil_core.errors import UserError
 from dmil_core.files import inside, read_json, write_file
 from services.storage.run_folders import make_folder
 from services.sweeps.settings import PlannedTrial, Preset, Sweep, planned
 
-Record = TypeVar("Record", bound=BaseModel)
 MOST_BYTES = 2**22
+ADVICE = "wanted that of a sweep, as in runs/NAME; start the sweep again, what is trained stays"
 MARK = "sweep.json"
 """What a sweep's folder is known by."""
 RESULT, TABLES = "result.json", "tables"
@@ -80,7 +79,7 @@ class SweepFolder:
             UserError: if it is no folder of a sweep.
         """
         self.path, self.runs = path, path.parent
-        self.record = _read(path, MARK, SweepRecord)
+        self.record = read_json(path, MARK, SweepRecord, MOST_BYTES, ADVICE)
 
     @classmethod
     def make(cls, path: Path, record: SweepRecord) -> "SweepFolder":
@@ -103,8 +102,9 @@ class SweepFolder:
         Raises:
             UserError: if the record of it is damaged.
         """
-        path = self.of_trial(name) / RESULT
-        return _read(self.path, path.relative_to(self.path), TrialResult) if path.exists() else None
+        path = (self.of_trial(name) / RESULT).relative_to(self.path)
+        exists = (self.path / path).exists()
+        return read_json(self.path, path, TrialResult, MOST_BYTES, ADVICE) if exists else None
 
     def finish(self, name: str, result: TrialResult) -> None:
         """Note what came of a trial."""
@@ -125,10 +125,3 @@ def evaluated(home: Path, evaluation: EvaluationConfig, tasks: Sequence[str]) ->
     """Return the folder of an evaluation's rows on some tasks, in that of the trained configuration."""
     described = "\n".join([evaluation.model_dump_json(exclude={"every"}), *tasks])
     return home / "evaluated" / sha256(described.encode())[:DIGITS]
-
-
-def _read(root: Path, name: str | Path, model: type[Record]) -> Record:
-    try:
-        return read_json(root, name, model, MOST_BYTES, "start the sweep again, what is trained stays")
-    except OSError as error:
-        raise UserError(f"{root / name}: got {error.strerror}; wanted a sweep's folder, as runs/NAME") from error

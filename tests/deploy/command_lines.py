@@ -96,7 +96,7 @@ def _refused_by_module(module: str, flags: Sequence[str]) -> str | None:
     if module == "pytest":
         return None
     said = io.StringIO()
-    for each in report.KINDS.values():
+    for each in report.REPORTS.values():
         import_module(each)  # before they are patched
     program = import_module("services.tracking.__main__" if module == "services.tracking" else module)
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
