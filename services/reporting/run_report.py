@@ -1,6 +1,7 @@
 """The page of a finished run: its figures, curves, settings and episodes, as one file."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from services.experiments.finished_run import FinishedRun
@@ -16,18 +17,10 @@ from services.reporting.run_group import group_runs, has_sub_skills
 from services.reporting.settings import settings_of_run
 from services.reporting.sub_skills import sub_skill_sections
 
-Writing = Callable[[FinishedRun], Sequence[Section]]
+Writing = Callable[[FinishedRun], Section | Sequence[Section]]
 
 
-def _rates(finished: FinishedRun) -> list[Section]:
-    return [rates_of_tasks(finished)]
-
-
-def _strip(finished: FinishedRun) -> list[Section]:
-    return [strip_of_run(finished)]
-
-
-def _sub_skills(finished: FinishedRun) -> list[Section]:
+def _sub_skills(finished: FinishedRun) -> Sequence[Section]:
     """Return what the high level chooses in tasks of meta-testing, and where, if there is a choice."""
     if not has_sub_skills(finished):
         return []
@@ -35,25 +28,21 @@ def _sub_skills(finished: FinishedRun) -> list[Section]:
     return [*sub_skill_sections(group), embedding_section(group)]
 
 
-def _curves(finished: FinishedRun) -> list[Section]:
-    return [training_curves(finished), adaptation_section(finished)]
-
-
-def _origin(finished: FinishedRun) -> list[Section]:
-    return [settings_of_run(finished), origin_of_run(finished), episodes_of_run(finished)]
-
-
-AT_THE_END: Sequence[Writing] = (_strip, _rates, _curves, _origin)
+AT_THE_END: Sequence[Writing] = (
+    strip_of_run,
+    rates_of_tasks,
+    training_curves,
+    adaptation_section,
+    settings_of_run,
+    origin_of_run,
+    episodes_of_run,
+)
 """The sections that a run writes when it ends: they take seconds."""
 
 
 def all_sections(*, videos: bool) -> Sequence[Writing]:
     """Return all sections of the page, in their order."""
-
-    def failures(finished: FinishedRun) -> list[Section]:
-        return [failures_of_run(finished, videos=videos)]
-
-    return _strip, _rates, failures, _sub_skills, _curves, _origin
+    return *AT_THE_END[:2], partial(failures_of_run, videos=videos), _sub_skills, *AT_THE_END[2:]
 
 
 def write_run_page(
@@ -70,7 +59,8 @@ def write_run_page(
     """
     written: list[Section] = []
     for write in sections:
-        written += write(finished)
+        made = write(finished)
+        written += [made] if isinstance(made, Section) else made
         advance()
     config = finished.config
     title = f"{finished.name}: {config.method.name} on {config.suite.name}"
