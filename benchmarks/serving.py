@@ -124,16 +124,8 @@ def serving(args: Arguments, token: str) -> Iterator[tuple[str, psutil.Process]]
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    command = [
-        sys.executable,
-        "-m",
-        "services.serve",
-        args.model,
-        "--port",
-        str(port),
-        "--replicas",
-        str(args.replicas),
-    ]
+    flags = ["--port", str(port), "--replicas", str(args.replicas)]
+    command = [sys.executable, "-m", "services.serve", args.model, *flags]
     environment = os.environ | {"DMIL_SERVE_TOKEN": token}
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as program:
         assert program.stdout is not None

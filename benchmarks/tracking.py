@@ -25,7 +25,8 @@ from benchmarks import harness
 from benchmarks.harness import BenchmarkArguments, alternate, lay_out, machine, main
 from benchmarks.workload import made_up_plan
 from services.cli.progress import console
-from services.distributed.runner import Iteration, LocalMetaTraining
+from services.distributed.runner import LocalMetaTraining
+from services.experiments.iteration_metrics import iteration_metrics
 from services.tracking.delivery import Identity
 from services.tracking.spool import read_spool
 from services.tracking.tracker import Tracker
@@ -112,7 +113,7 @@ class Run:
         """Do the next iterations and track them, as an experiment does."""
         began = time.process_time()
         for iteration in self._training.iterations(count):
-            metrics = _metrics(iteration)
+            metrics = iteration_metrics(iteration)
             if self.tracker is not None:
                 called = time.perf_counter()
                 self.tracker.metrics(iteration.number, metrics)
@@ -133,11 +134,6 @@ class Run:
             sum(1 for _ in read_spool(self.folder / "tracking.jsonl")),
             Identity.of(self.folder).delivered if self.tracker is not None else 0,
         )
-
-
-def _metrics(iteration: Iteration) -> dict[str, float]:
-    means = {name: float(np.mean([slot[name] for slot in iteration.slots])) for name in iteration.slots[0]}
-    return means | {"gradient_norm": iteration.gradient_norm, "iterations_per_second": 1 / iteration.timing.iteration}
 
 
 def measure(folder: Path, slow: str, rounds: int, iterations: int) -> list[Row]:

@@ -69,7 +69,10 @@ def run(arguments: Sequence[str]) -> None:
         nodes, silent = [facts(str(args.runs), mark)], []
     findings += [Finding(f"node {name}", "bad", "does not answer", "look at it, or take it away") for name in silent]
     findings += [*examine(nodes), _mlflow()]
-    console.print(_table(findings))
+    table = Table("check", "", "found", "what to do", title="before a long run")
+    for finding in findings:
+        table.add_row(*finding)
+    console.print(table)
     if bad := [finding.what for finding in findings if finding.verdict == "bad"]:
         raise RunError(f"{len(bad)} of {len(findings)} checks are bad: {', '.join(bad)}; see what to do above")
     console.print("all that a run needs is there")
@@ -188,13 +191,6 @@ def _mlflow() -> Finding:
             "start it, or mend MLFLOW_TRACKING_URI; a run would go on without, and keep its records",
         )  # fmt: skip
     return Finding("MLflow", "good", f"{redacted(uri)}: takes records")
-
-
-def _table(findings: Sequence[Finding]) -> Table:
-    table = Table("check", "", "found", "what to do", title="before a long run")
-    for finding in findings:
-        table.add_row(*finding[:1], finding.verdict, finding.got, finding.remedy)
-    return table
 
 
 if __name__ == "__main__":

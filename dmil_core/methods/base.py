@@ -195,6 +195,7 @@ class Batch(Protocol):
     @property
     def ids(self) -> Sequence[str]:
         """Ids of its demonstrations."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -227,7 +227,7 @@ def _write(folder: Path, successes: Sequence[Episode], metadata: dict[str, Any])
     """Write a Minari data set and the digests of its files."""
     storage = MinariStorage.new(
         folder / "data",
-        observation_space=_box(successes[0].observations),
+        observation_space=gymnasium.spaces.Box(-np.inf, np.inf, successes[0].observations.shape[1:], np.float32),
         action_space=gymnasium.spaces.Box(-1, 1, successes[0].actions.shape[1:], np.float32),
     )
     storage.update_metadata(metadata)
@@ -272,10 +272,6 @@ def _find_array(file: h5py.File, name: str) -> h5py.Dataset:
     if array.dtype != np.float32 or array.ndim != 2:
         raise ValueError(f"{name}: got {array.dtype} of the shape {array.shape}; wanted float32, (steps, dimensions)")
     return array
-
-
-def _box(observations: np.ndarray) -> gymnasium.spaces.Box:
-    return gymnasium.spaces.Box(-np.inf, np.inf, observations.shape[1:], np.float32)
 
 
 def _episode(attempt: Episode) -> EpisodeBuffer:

@@ -71,9 +71,11 @@ class MetaTraining(Protocol):
 
     def iterations(self, count: int) -> Iterator[Iteration]:
         """Run the next `count` iterations. No outer step is taken before its iteration is requested."""
+        ...
 
     def state(self) -> OuterState:
         """Return the learner's state after the last whole iteration."""
+        ...
 
     def close(self) -> None:
         """Stop the learner and the adaptation workers."""
@@ -84,9 +86,11 @@ class Simulation(Protocol[ResultOut]):
 
     def done(self) -> bool:
         """Return, without waiting, whether all results are there."""
+        ...
 
     def result(self) -> Sequence[ResultOut]:
         """Wait for all results and return them in the order of the items."""
+        ...
 
 
 class Runner(Protocol):
@@ -95,22 +99,28 @@ class Runner(Protocol):
     @property
     def meter(self) -> Meter:
         """Records the metrics of the work."""
+        ...
 
     @property
     def worker_counts(self) -> Sequence[Workers]:
         """The workers of each kind that there are beside this process."""
+        ...
 
     def share(self, value: T) -> Callable[[], T]:
         """Return a function that returns `value` in any process; in work items it travels to each node once."""
+        ...
 
     def simulate(self, items: Sequence[WorkItem[T]]) -> Iterator[tuple[int, T]]:
         """Run work items on the simulation workers; yield each index and result as they arrive."""
+        ...
 
     def simulate_in_background(self, items: Sequence[WorkItem[T]]) -> Simulation[T]:
         """Start to run work items beside meta-training; in one process, run them now."""
+        ...
 
     def meta_train(self, plan: Plan) -> MetaTraining:
         """Start the learner and the adaptation workers."""
+        ...
 
     def close(self) -> None:
         """Stop everything that was started."""

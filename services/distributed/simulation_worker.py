@@ -25,13 +25,16 @@ class WorkItem(Protocol[ResultOut]):
     @property
     def label(self) -> str:
         """Its name in messages."""
+        ...
 
     @property
     def key(self) -> dict[str, str | int]:
         """What identifies it in ``failure.json``."""
+        ...
 
     def run(self, worker: "SimulationWorker") -> ResultOut:
         """Do the work in the worker's environments."""
+        ...
 
 
 class SimulationWorker:

@@ -14,6 +14,8 @@ from services.rollouts.episodes import demonstrate, rollout
 from services.suites.base import Environment, Expert
 from services.suites.rendering import Camera, View
 
+NUMBER = (int, float, np.number, np.bool_)
+
 
 class VideoSettings(NamedTuple):
     """How an episode is filmed."""
@@ -62,7 +64,7 @@ class _RecordingWrapper(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, SupportsFloat, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._infos.append({name: float(value) for name, value in info.items() if _is_number(value)})
+        self._infos.append({name: float(value) for name, value in info.items() if isinstance(value, NUMBER)})
         if self._video is not None and len(self._infos) % self._video.every == 0:
             self._draw()
         return observation, reward, terminated, truncated, info
@@ -84,10 +86,6 @@ class _RecordingWrapper(gymnasium.Wrapper[np.ndarray, np.ndarray, np.ndarray, np
         """Free the camera; the environment stays open."""
         if self._camera is not None:
             self._camera.close()
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float | np.number | np.bool_)
 
 
 def record_rollouts(

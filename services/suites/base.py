@@ -28,6 +28,7 @@ class Expert(Protocol):
 
     def get_action(self, obs: Float64[np.ndarray, " obs_dim"], /) -> Float32[np.ndarray, " action_dim"]:
         """Return what the expert does, before clipping to the action space."""
+        ...
 
 
 class Measure(NamedTuple):
@@ -73,9 +74,11 @@ class TaskSuite(Protocol):
 
     def make_env(self, task: str) -> Environment:
         """Build a task's environment; it may be reset and reused for any number of episodes."""
+        ...
 
     def expert(self, task: str) -> Expert | None:
         """Return a task's scripted expert, if there is one."""
+        ...
 
 
 def with_points(config: ExperimentConfig, suite: TaskSuite) -> ExperimentConfig:

@@ -78,7 +78,9 @@ def show(tables: Tables, sweep: SweepFolder) -> None:
     """Print the table, the differences, what failed, and where all of it is written."""
     digits = DIGITS[tables.metric]
     if tables.samples:
-        console.print(_samples_view(tables))
+        view = Table(*SAMPLE, title=_head(tables))
+        for sample in tables.samples:
+            view.add_row(*_sample_fields(sample))
     else:
         grid = _grid(tables)
         view = Table(
@@ -86,7 +88,7 @@ def show(tables: Tables, sweep: SweepFolder) -> None:
         )
         for row in tables.rows:
             view.add_row(row, *["\n".join(_lines(grid[row].get(column), digits)) for column in tables.columns])
-        console.print(view)
+    console.print(view)
     if tables.differences:
         view = Table(*DIFFERENCE)
         for pair in tables.differences:
@@ -98,13 +100,6 @@ def show(tables: Tables, sweep: SweepFolder) -> None:
         console.print(f"failed: {name}: {error}")
     console.print(f"tables: {sweep.path / 'tables'}")
     console.print(f"page: {sweep.path / 'tables' / 'report.html'}")
-
-
-def _samples_view(tables: Tables) -> Table:
-    view = Table(*SAMPLE, title=_head(tables))
-    for sample in tables.samples:
-        view.add_row(*_sample_fields(sample))
-    return view
 
 
 def _sample_fields(sample: Sample) -> list[str]:
