@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -9,20 +10,21 @@ from jaxtyping import Float32
 
 from dmil_core.configs import DemonstrationConfig, EvaluationConfig
 from dmil_core.demonstrations import Demonstration
+from dmil_core.devices import adapted_on, describe
 from dmil_core.errors import as_work_error
-from dmil_core.methods.base import Method
-from dmil_core.networks import Parameters, unflatten
+from dmil_core.methods.base import Method, Policy
+from dmil_core.networks import unflatten
 from dmil_core.seeding import named_seed
 from dmil_core.trajectories import Episode
 from services.distributed.simulation_worker import SimulationWorker
 from services.rollouts.adaptations import (
     Adaptation,
     AdaptationOutcome,
+    EpisodeOutcome,
     ImitationErrors,
-    evaluate_adaptation,
-    imitation_errors,
+    imitation_error,
 )
-from services.rollouts.episodes import demonstrate
+from services.rollouts.episodes import demonstrate, rollout
 from services.rollouts.verification import VerificationRow, verify
 
 
@@ -109,29 +111,41 @@ class AdaptationItem:
         """What identifies it in ``failure.json``."""
         return self.adaptation.key
 
-    def parameters(self) -> Parameters:
-        """Return a copy of the parameters to adapt."""
-        return unflatten(torch.tensor(self.flat_parameters()), self.shapes)
+    def adapted(self, worker: SimulationWorker) -> "Adapted":
+        """Adapt a copy of the parameters on the worker's device; the policy acts on the CPU."""
+        device, held_out = worker.device_for(self.method), self.held_out()
+        support = self.adaptation.support(held_out)
+        parameters = unflatten(torch.tensor(self.flat_parameters()), self.shapes)
+        policy = adapted_on(device, self.method, parameters, support, self.evaluation.fine_tuning)
+        others = [demonstration for demonstration in held_out if demonstration not in support]
+        return Adapted(policy, support, others, describe(device))
+
+
+class Adapted(NamedTuple):
+    """What came of an adaptation."""
+
+    policy: Policy
+    support: Sequence[Demonstration]
+    others: Sequence[Demonstration]
+    """The held-out demonstrations of the task that it was not adapted to."""
+    device: str
+    """What adapted, as rows name it."""
 
 
 class AdaptationRollouts(AdaptationItem):
     """Judges an adapted policy by episodes."""
 
     def run(self, worker: SimulationWorker) -> AdaptationOutcome:
-        """Adapt, and run the episodes."""
-        envs, horizon = worker.environments(self.adaptation.task, len(self.adaptation.episodes)), worker.suite.horizon
-        device = worker.device_for(self.method)
-        return evaluate_adaptation(
-            self.method,
-            self.parameters(),
-            self.adaptation,
-            self.held_out(),
-            envs,
-            horizon,
-            self.evaluation,
-            self.seed,
-            device,
-        )
+        """Adapt, and run the episodes.
+
+        An episode is named by the experiment's seed, the task and its own number, so that all shots and methods meet
+        the same episodes.
+        """
+        task, numbers = self.adaptation.task, self.adaptation.episodes
+        envs, adapted = worker.environments(task, len(numbers)), self.adapted(worker)
+        seeds = [named_seed(self.seed, "evaluation", task, number) for number in numbers]
+        episodes = [EpisodeOutcome.of(one) for one in rollout(adapted.policy, envs, seeds, worker.suite.horizon)]
+        return AdaptationOutcome(episodes, list(map(adapted.policy.sub_skill_use, adapted.others)), adapted.device)
 
 
 class AdaptationImitation(AdaptationItem):
@@ -139,7 +153,6 @@ class AdaptationImitation(AdaptationItem):
 
     def run(self, worker: SimulationWorker) -> ImitationErrors:
         """Adapt, and compare the policy with demonstrations; nothing is simulated."""
-        device = worker.device_for(self.method)
-        return imitation_errors(
-            self.method, self.parameters(), self.adaptation, self.held_out(), self.evaluation, device
-        )
+        policy, support, others, device = self.adapted(worker)
+        of_others = imitation_error(policy, others) if others else None
+        return ImitationErrors(imitation_error(policy, support), of_others, device)

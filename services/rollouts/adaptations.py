@@ -1,21 +1,16 @@
-"""Episodes of a policy or an expert in a suite's environments: pure, named by their seeds, no Ray."""
+"""Adaptations to support sets, and what is kept of the episodes that judge them: pure, no Ray."""
 
 from collections.abc import Mapping, Sequence
 from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from dmil_core.configs import EvaluationConfig
 from dmil_core.demonstrations import Demonstration
-from dmil_core.devices import CPU, adapted_on, describe
-from dmil_core.methods.base import Method, Policy, SubSkillUse
-from dmil_core.networks import Parameters
-from dmil_core.seeding import named_seed
+from dmil_core.methods.base import Policy, SubSkillUse
 from dmil_core.trajectories import Rollout
-from services.rollouts.episodes import rollout
-from services.suites.base import Environment, Split
+from services.suites.base import Split
 
 
 class Adaptation(NamedTuple):
@@ -111,32 +106,6 @@ class AdaptationOutcome(NamedTuple):
     """What adapted, as rows name it."""
 
 
-def evaluate_adaptation(
-    method: Method,
-    parameters: Parameters,
-    adaptation: Adaptation,
-    held_out: Sequence[Demonstration],
-    envs: Sequence[Environment],
-    horizon: int,
-    evaluation: EvaluationConfig,
-    seed: int,
-    device: torch.device = CPU,
-) -> AdaptationOutcome:
-    """Adapt to a support set and run the episodes that judge it: a pure function of its arguments.
-
-    An episode is named by the experiment's seed, the task and its own number, so that all shots and methods meet the
-    same episodes. `held_out` are demonstrations of the task that meta-training has not seen; the device adapts, the
-    policy acts on the CPU.
-    """
-    support = adaptation.support(held_out)
-    policy = adapted_on(device, method, parameters, support, evaluation.fine_tuning)
-    seeds = [named_seed(seed, "evaluation", adaptation.task, episode) for episode in adaptation.episodes]
-    others = [demonstration for demonstration in held_out if demonstration not in support]
-    episodes = [EpisodeOutcome.of(episode) for episode in rollout(policy, envs, seeds, horizon)]
-    use = [policy.sub_skill_use(demonstration) for demonstration in others]
-    return AdaptationOutcome(episodes, use, describe(device))
-
-
 class ImitationErrors(NamedTuple):
     """The `imitation_error` of an adapted policy."""
 
@@ -146,19 +115,3 @@ class ImitationErrors(NamedTuple):
     """On the held-out demonstrations of the task that it was not adapted to, where there are any."""
     device: str = "cpu"
     """What adapted, as rows name it."""
-
-
-def imitation_errors(
-    method: Method,
-    parameters: Parameters,
-    adaptation: Adaptation,
-    held_out: Sequence[Demonstration],
-    evaluation: EvaluationConfig,
-    device: torch.device = CPU,
-) -> ImitationErrors:
-    """Adapt to a support set and compare the policy with demonstrations: no episodes, else as `evaluate_adaptation`."""
-    support = adaptation.support(held_out)
-    policy = adapted_on(device, method, parameters, support, evaluation.fine_tuning)
-    others = [demonstration for demonstration in held_out if demonstration not in support]
-    of_others = imitation_error(policy, others) if others else None
-    return ImitationErrors(imitation_error(policy, support), of_others, describe(device))

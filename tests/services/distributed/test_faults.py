@@ -268,7 +268,7 @@ def test_a_failing_expert_and_a_failing_trial_are_named(
     train("run", "--training.iterations", "1")
     capsys.readouterr()
     with monkeypatch.context() as patch:
-        patch.setattr("services.distributed.work_items.evaluate_adaptation", lambda *given: 1 / 0)
+        patch.setattr("services.distributed.work_items.rollout", lambda *given: 1 / 0)
         assert exit_code(meta_train.run, ["--resume", "run", "--runner", "local"]) == 1
         said = capsys.readouterr().err
         assert "meta-training task reach, 1-shot, support set 0, seed 0: ZeroDivisionError: division by zero" in said
