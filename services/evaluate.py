@@ -136,11 +136,7 @@ def run(arguments: Sequence[str]) -> None:
 def _config(
     checkpoint: "Checkpoint", args: Arguments, tasks: tuple[str, ...] | None, demos: str | None
 ) -> ExperimentConfig:
-    """Return the settings of the evaluation.
-
-    Raises:
-        UserError: for some that do not go together.
-    """
+    """Return the settings of the evaluation."""
     config = with_evaluation(checkpoint.manifest.config, args.evaluation)
     changed: dict[str, dict[str, Any]] = {}
     if tasks is not None:
@@ -158,11 +154,7 @@ def _config(
 
 
 def _new_folder(args: Arguments, checkpoint: "Checkpoint") -> Path:
-    """Return the folder of an evaluation, which is not there yet.
-
-    Raises:
-        UserError: if somebody has named one that is.
-    """
+    """Return the folder of an evaluation, which is not there yet."""
     if args.output is not None:
         if args.output.exists():
             raise UserError(f"--output: got {args.output}, which is there already; wanted the name of a new folder")

@@ -40,6 +40,7 @@ from services.tracking.tracker import Tracker, record_settings
 if TYPE_CHECKING:
     from dmil_core.devices import Compute
     from services.experiments.experiment import Experiment
+    from services.storage.checkpoints import Checkpoints
 
 MARK = "config.json"
 """What a run's folder is known by."""
@@ -166,7 +167,7 @@ def _carry_out(args: Arguments, folder: Path, experiment: "Experiment") -> None:
 
 
 @contextmanager
-def _telling_how_to_go_on(folder: Path, checkpoints: Checkpoints) -> Iterator[None]:
+def _telling_how_to_go_on(folder: Path, checkpoints: "Checkpoints") -> Iterator[None]:
     """Where a run is stopped, or fails when it has a checkpoint, print the line that goes on with it."""
     try:
         yield
@@ -213,11 +214,7 @@ def _read(arguments: Sequence[str]) -> tuple[Arguments, Path]:
 
 
 def _same_run(before: ExperimentConfig, now: ExperimentConfig) -> None:
-    """Refuse to go on under other settings than the run began with.
-
-    Raises:
-        UserError: names the sections that differ.
-    """
+    """Refuse to go on under other settings than the run began with."""
     from services.experiments.experiment import changed_settings
 
     if changed := changed_settings(before, now):

@@ -75,11 +75,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _check(args: Arguments) -> None:
-    """Refuse numbers that nothing can be made of.
-
-    Raises:
-        UserError: names the flag.
-    """
+    """Refuse numbers that nothing can be made of."""
     least = {"shots": 1, "rollouts": 0, "embedding_shots": 1, "perplexity": 1, "seed": 0}
     for name, bound in least.items():
         if not (got := getattr(args, name)) >= bound:
@@ -87,11 +83,7 @@ def _check(args: Arguments) -> None:
 
 
 def _labelled_runs(which: Sequence[str], runs: Path) -> "dict[str, FinishedRun]":
-    """Return the runs by their labels.
-
-    Raises:
-        UserError: for none at all, two of one label, or one that there is not.
-    """
+    """Return the runs by their labels."""
     from services.experiments.finished_run import FinishedRun
     from services.reporting.run_group import has_sub_skills
 

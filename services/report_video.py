@@ -68,11 +68,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _row_of(finished: "FinishedRun", args: Arguments) -> EpisodeResult:
-    """Return the row of the episode that is asked for.
-
-    Raises:
-        UserError: if the run has none, with those that it has.
-    """
+    """Return the row of the episode that is asked for."""
     rows = finished.episodes
     tasks = dict.fromkeys(row.task for row in rows)
     if args.task not in tasks:
