@@ -33,14 +33,7 @@ class WorkError(RuntimeError):
     """A Python error in a work item, with all that is needed to run the item again, alone."""
 
     def __init__(self, label: str, problem: str, trace: str, key: Mapping[str, str | int]) -> None:
-        """Describe an error.
-
-        Args:
-            label: name of the work item in messages.
-            problem: last line of the traceback.
-            trace: the whole traceback.
-            key: what identifies the item among all.
-        """
+        """Name the item by `label` in messages and by `key` among all; `problem` is the last line of `trace`."""
         super().__init__(label, problem, trace, key)  # all, for it travels between processes
         self.label, self.problem, self.trace, self.key = label, problem, trace, key
 

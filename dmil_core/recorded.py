@@ -114,11 +114,8 @@ def _demonstration(one: Any, index: int, interface: Interface) -> Demonstration:
     else:
         raise DemonstrationError(f"{name}: got {shorten(one)}; wanted a pair of arrays, (observations, actions)")
     observations, actions = numbers(_flat(parts[0]), f"{name}: observations"), numbers(parts[1], f"{name}: actions")
-    for field, values, wanted in (
-        ("observations", observations, interface.obs_dim),
-        ("actions", actions, interface.action_dim),
-    ):
-        _check_shape(f"{name}: {field}", values, wanted, interface)
+    _check_shape(f"{name}: observations", observations, interface.obs_dim, interface)
+    _check_shape(f"{name}: actions", actions, interface.action_dim, interface)
     if isinstance(one, Demonstration):
         return one
     paired = observations[:-1] if len(observations) == len(actions) + 1 else observations

@@ -88,15 +88,8 @@ def _table(data: dict[str, TaskDemonstrations]) -> Table:
         view.add_column(column, justify="left" if column in ("task", "Minari id") else "right", overflow="fold")
     for task, dataset in data.items():
         lengths = [len(demonstration) for demonstration in dataset.demonstrations]
-        view.add_row(
-            task,
-            str(len(lengths)),
-            str(dataset.failed),
-            f"{np.mean(lengths):.1f}",
-            str(max(lengths)),
-            dataset.digest[:12],
-            dataset.id,
-        )
+        steps = [f"{np.mean(lengths):.1f}", str(max(lengths))]
+        view.add_row(task, str(len(lengths)), str(dataset.failed), *steps, dataset.digest[:12], dataset.id)
     return view
 
 

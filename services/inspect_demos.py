@@ -121,14 +121,9 @@ def _table(place: str, episodes: Sequence[ExternalEpisode], suite: TaskSuite | N
         view.add_column(column, justify="left" if column == "replayed" else "right")
     with Bar("reading", len(episodes)) as bar:
         for index, one in enumerate(episodes):
-            row = [
-                str(index),
-                str(len(one.actions)),
-                _range(one.observations),
-                _range(one.actions),
-                "" if one.reward is None else f"{one.reward:g}",
-                "" if one.success is None else ("yes" if one.success else "no"),
-            ]
+            reward = "" if one.reward is None else f"{one.reward:g}"
+            success = "" if one.success is None else "yes" if one.success else "no"
+            row = [str(index), str(len(one.actions)), _range(one.observations), _range(one.actions), reward, success]
             view.add_row(*row, *([] if replay is None or suite is None else [_replayed(one, suite)]))
             bar.advance(1)
     return view

@@ -105,19 +105,9 @@ def _runs_table(group: "RunGroup") -> "DataTable":
 
     rows = []
     for label, run in group.runs.items():
-        evaluation, checkpoint = run.config.evaluation, run.checkpoint
-        rows.append(
-            [
-                label,
-                run.config.method.name,
-                getattr(run.config.method, "sub_skills", "none"),
-                run.config.suite.name,
-                run.config.seed,
-                checkpoint.manifest.iteration,
-                evaluation.fine_tuning_steps,
-                f"{evaluation.learning_rate:g}",
-                checkpoint.digest[:12],
-            ]
-        )
+        config, checkpoint = run.config, run.checkpoint
+        method = [config.method.name, getattr(config.method, "sub_skills", "none"), config.suite.name, config.seed]
+        tuning = [config.evaluation.fine_tuning_steps, f"{config.evaluation.learning_rate:g}"]
+        rows.append([label, *method, checkpoint.manifest.iteration, *tuning, checkpoint.digest[:12]])
     head = ["run", "method", "sub-skills", "suite", "seed", "iterations", "fine-tuning steps", "learning rate"]
     return DataTable("The runs", [*head, "checkpoint"], rows)

@@ -101,10 +101,8 @@ def episodes_in(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the observations and actions of each episode.
 
-    Args:
-        observations: (steps, numbers) of all episodes, or stacked, (episodes, steps, numbers).
-        actions: likewise.
-        lengths: of the episodes, where they lie one after the other; none if it is one, or they are stacked.
+    Both are (steps, numbers) of all episodes, or stacked, (episodes, steps, numbers). Episodes that lie one after the
+    other have `lengths`, unless there is but one.
 
     Raises:
         DemonstrationError: if they do not belong together.

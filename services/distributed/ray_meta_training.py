@@ -58,15 +58,10 @@ class RayMetaTraining:
     ) -> None:
         """Start the actors; the demonstrations travel to each node once.
 
-        Args:
-            plan: what to train, and from which state.
-            workers: number of adaptation workers, or a function that returns it as the cluster changes; at most one
-                for each group of slots is started.
-            fan_in: gradients that a worker adds at a time, a power of two.
-            gpus: of each worker; the actors have the shares of `SHARES` of it.
-            meter: records iterations, workers, and slots that are computed again.
-            min_workers: workers to begin with, all by default; the others join when there is room for them.
-            compute: what computes.
+        At most one adaptation worker is started for each group of slots, of `workers`, a number or a function that
+        returns it as the cluster changes: `min_workers` to begin with, all by default, and the others when there is
+        room for them. Each adds `fan_in` gradients at a time, a power of two. The actors have the shares of `SHARES` of
+        each worker's `gpus`. The meter records iterations, workers, and slots that are computed again.
         """
         import ray
 

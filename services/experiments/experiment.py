@@ -283,8 +283,7 @@ def check_settings(resume: Checkpoint, config: ExperimentConfig, origin: Path) -
     Raises:
         UserError: names file and keys, or the number of iterations where that was passed already.
     """
-    before, now = resume.manifest.config, config
-    if changed := changed_settings(before, now):
+    if changed := changed_settings(resume.manifest.config, config):
         raise UserError(
             f"{origin}: got other settings than {resume.path / MANIFEST}, which was trained with "
             f"{', '.join(f'{key} {shorten(old)}, not {shorten(new)}' for key, (old, new) in changed.items())}; wanted "

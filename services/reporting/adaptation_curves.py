@@ -270,18 +270,11 @@ def _course(measured: Sequence[Point], shots: int) -> str:
 
 
 def _table(measured: Sequence[Point]) -> DataTable:
-    rows = [
-        [
-            point.shots,
-            point.steps,
-            f"{point.success.mean:.3f}",
-            interval_text(point.success.low, point.success.high, 3),
-            f"{round(point.success.mean * point.success.episodes)} of {point.success.episodes}",
-            "" if point.held_out_error is None else f"{point.held_out_error:.4f}",
-            "" if point.support_error is None else f"{point.support_error:.4f}",
-        ]
-        for point in measured
-    ]
+    rows = []
+    for shots, steps, rate, *errors in measured:
+        success = [f"{rate.mean:.3f}", interval_text(rate.low, rate.high, 3)]
+        losses = ["" if error is None else f"{error:.4f}" for error in errors]
+        rows.append([shots, steps, *success, f"{round(rate.mean * rate.episodes)} of {rate.episodes}", *losses])
     head = ["shots", "fine-tuning steps", "success rate", "95% interval", "episodes"]
     head += ["loss on held-out demonstrations", "loss on the support set"]
     return DataTable("Success and loss over fine-tuning steps, all tasks together", head, rows)

@@ -52,12 +52,9 @@ def publish(tracker: Tracker, summary: Summary, folder: Path) -> None:
         tracker.tags({"simulator_faults": summary.faults})
     tracker.metrics(Checkpoint(Path(summary.checkpoint)).manifest.iteration, metrics, anew=True)
     tracker.tags({"mlflow.note.content": table_markdown(summary)})
-    for path, destination in (
-        (folder / REPORT, REPORT),
-        (folder / "summary.json", None),
-        (folder / "episodes.jsonl", None),
-    ):
-        tracker.artifact(path, destination)
+    tracker.artifact(folder / REPORT, REPORT)
+    for name in ("summary.json", "episodes.jsonl"):
+        tracker.artifact(folder / name)
 
 
 def show(summary: Summary, addresses: Sequence[str] = ()) -> None:

@@ -71,10 +71,8 @@ def comparison_of(sweep: SweepFolder, baseline: str | None = None) -> Comparison
     )
     if settings.paper is None:
         return comparison
-    paper_figures = {key: figure(settings.paper, *key) for key in comparison.keys}
-    return replace(
-        comparison, published={key: published for key, published in paper_figures.items() if published is not None}
-    )
+    figures = {key: found for key in comparison.keys if (found := figure(settings.paper, *key)) is not None}
+    return replace(comparison, published=figures)
 
 
 def suite_of(trial: PlannedTrial) -> str:

@@ -111,11 +111,12 @@ def _run(sweep: SweepFolder, trial: PlannedTrial, store: DemoStore, tracker: Tra
         with held(home, wait=True):  # two sweeps may want it
             with replicated(home, TRAINED, restore=True):
                 checkpoints = Checkpoints(home / "checkpoints", config.training.checkpoints_kept)
-                checkpoint = _whole(checkpoints, config.training.iterations)
-                if checkpoint is None:
+                checkpoint = checkpoints.newest() if checkpoints.all() else None
+                if checkpoint is None or checkpoint.manifest.iteration < config.training.iterations:
                     write_file(home, "config.json", config.model_dump_json(indent=1) + "\n")
-                    newest = checkpoints.newest() if checkpoints.all() else None
-                    checkpoint = experiment.train(runner, data, checkpoints, tracker, newest, overlap_evaluation=False)
+                    checkpoint = experiment.train(
+                        runner, data, checkpoints, tracker, checkpoint, overlap_evaluation=False
+                    )
                     curves = read_metrics(sweep.of_trial(trial.name))
                     write_file(home, "metrics.json", _METRICS.dump_json(curves))
                 else:
@@ -145,12 +146,6 @@ def _run(sweep: SweepFolder, trial: PlannedTrial, store: DemoStore, tracker: Tra
         environment_steps=checkpoint.manifest.environment_steps,
         held_out=float(np.mean(held_out)),
     )
-
-
-def _whole(checkpoints: Checkpoints, iterations: int) -> Checkpoint | None:
-    """Return the last checkpoint of a training that came to its end."""
-    newest = checkpoints.newest() if checkpoints.all() else None
-    return newest if newest is not None and newest.manifest.iteration >= iterations else None
 
 
 def _copy_curves(home: Path, tracker: Tracker) -> None:

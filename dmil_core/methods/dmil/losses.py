@@ -19,11 +19,9 @@ def soft_labels(
 ) -> Float[Tensor, "steps sub_skills"]:
     """Return the posterior of each sub-skill, softmax_k(−‖π_k(s_t) − a_t‖² / 2σ²): the E-step of the soft EM (E.6).
 
-    Args:
-        errors: squared, of each sub-skill at each step.
-        deviation: σ.
-        transposed: without it the matrix is read out row by row into one of the wanted shape, as in the authors'
-            released code: a step is then given the weights of other steps, which need not add up to 1.
+    The errors are squared, and σ is `deviation`. Not `transposed`, the matrix is read out row by row into one of the
+    wanted shape, as in the authors' released code: a step is then given the weights of other steps, which need not add
+    up to 1.
     """
     posterior = (errors / (-2 * deviation**2)).softmax(0)
     return posterior.T if transposed else posterior.reshape(posterior.shape[::-1])

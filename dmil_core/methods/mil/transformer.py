@@ -113,16 +113,9 @@ def encode(
 ) -> Float[Tensor, "steps+1 units"]:
     """Return what the encoder makes of demonstrated steps, of which there may be none.
 
-    A learned token comes first, so that there is always one to attend to.
-
-    Args:
-        parameters: of the transformer.
-        states: standardised.
-        actions: taken there.
-        positions: the encoding of each step's place in its demonstration.
-        demonstrations: which one each step belongs to.
-        heads: of each attention.
-        drop: applied to the embeddings and to what each part of a layer adds.
+    A learned token comes first, so that there is always one to attend to. The states are standardised; `positions`
+    encode each step's place in its demonstration, and `demonstrations` says which one that is. `drop` is applied to the
+    embeddings and to what each part of a layer adds.
     """
     embedded = _affine(parameters, "encoder.embedding", torch.cat([states, actions], -1))
     embedded = embedded + positions + parameters["encoder.demonstration.weight"][demonstrations]
