@@ -273,6 +273,8 @@ def preset_of(suite: str, preset: str, method: str = DEFAULT_METHOD) -> Experime
     seeing: list[dict[str, dict[str, Any]]] = []
     if preset == "quick" and WITH_POINTS.fullmatch(suite):
         seeing = [WITH_POINTS_QUICK, *([CONTEXT_QUICK] if issubclass(method_config, ContextConfig) else [])]
+        if "balance" in method_config.model_fields:
+            changes["method"]["balance"] = "sinkhorn"  # no sub-skill without states, at no loss of success
     settings = config.model_dump(exclude={"method"}) | {"method": {}}
     for changed in (method_config.presets.get(preset, {}), *seeing, changes):
         settings |= {section: settings[section] | values for section, values in changed.items()}
