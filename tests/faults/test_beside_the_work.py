@@ -168,7 +168,7 @@ def test_what_ends_a_start_has_taken_the_name_with_settings_to_go_on_with_or_not
     def stopped(*arguments: object) -> None:
         raise KeyboardInterrupt
 
-    for module, function in ((run_folders, "create_file"), (meta_train, "claim_name")):
+    for module, function in ((run_folders, "create_file"), (replication, "claim_name")):
         with monkeypatch.context() as interrupted:
             interrupted.setattr(module, function, stopped)
             assert exit_code(meta_train.run, [*TOY, *SHORT, "--name", "run"]) == 130
