@@ -23,9 +23,12 @@ TRAJECTORY_STEPS = {"paper": 100, "quick": 24}
 
 
 def settings(size: Size, sub_skills: int, order: Literal["first", "second"]) -> DmilConfig:
-    """Return a preset's method with other sub-skills and order: width 512 for ``paper``, 256 for ``quick``."""
+    """Return a preset's method with other sub-skills and order: width 512 for ``paper``, 256 for ``quick``.
+
+    Its labels are the paper's, not balanced, as those of the reference are that it is compared with.
+    """
     preset = PRESETS[f"ml10-{size}"].method.model_dump()
-    return DmilConfig.model_validate({**preset, "sub_skills": sub_skills, "order": order})
+    return DmilConfig.model_validate({**preset, "sub_skills": sub_skills, "order": order, "balance": "none"})
 
 
 def draw_steps(seed: int, trajectories: int, length: int) -> Steps:
