@@ -31,7 +31,7 @@ RECENT = 50
 """Iterations behind the losses and the shares of sub-skills on the screen."""
 COLLAPSED_ITERATIONS = 100
 """Iterations that one sub-skill may take nearly all states before a warning."""
-RUN_ID_SECONDS = 20.0
+RUN_ID_SECONDS = 60.0
 """How long the last checkpoint waits for the MLflow run's id; the others do not."""
 
 

@@ -1,7 +1,6 @@
 """Pictures of MuJoCo environments, drawn without a screen."""
 
 import os
-from contextlib import closing
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -36,7 +35,7 @@ class View(NamedTuple):
 
 
 class Camera:
-    """Draws what happens in one environment, picture after picture, until it is closed.
+    """Draws what happens in one environment, picture after picture; to be used in a ``with``.
 
     What is costly, to bring the model's meshes and textures to OpenGL, is done once.
     """
@@ -81,6 +80,12 @@ class Camera:
         upright = number < 0 or data.cam_xmat[number].reshape(3, 3)[2, 1] >= 0
         return (pixels[::-1] if upright else pixels[:, ::-1]).copy()  # OpenGL's first row is the lowest
 
+    def __enter__(self) -> "Camera":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
     def close(self) -> None:
         """Give back what OpenGL holds."""
         self._surface.make_current()
@@ -92,7 +97,7 @@ def picture(
     env: gymnasium.Env[Any, Any], view: str | View, height: int = 360, width: int = 480
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Draw a single picture, see `Camera`."""
-    with closing(Camera(env, view, height, width)) as camera:
+    with Camera(env, view, height, width) as camera:
         return camera.picture()
 
 

@@ -42,8 +42,8 @@ KIND = {"mlflow.experimentKind": "custom_model_development"}
 """So MLflow shows the pages for training, not those for applications of language models."""
 SLOW_SECONDS = 5.0
 """A server that takes longer for a call is not waited for."""
-OPENING_SECONDS = 20.0
-"""A database has longer: on its first use MLflow makes its tables."""
+OPENING_SECONDS = 60.0
+"""A database has longer: on its first use MLflow makes its tables, on a busy machine for half a minute."""
 SENDING_SECONDS = 60.0
 """So have files."""
 ID = "^[0-9a-f]{32}$"

@@ -132,7 +132,7 @@ class Tracker:
         example = Example.model_validate(packed(parts, parts[0].observations[0]))
         self._spool.append("model", Trained(checkpoint=str(below), example=example))
 
-    def wait_for_run_id(self, timeout: float = 20.0) -> str | None:
+    def wait_for_run_id(self, timeout: float = 60.0) -> str | None:
         """Return the MLflow run's id, or None if it is not known yet.
 
         It is waited for, up to so many seconds from the tracker's opening, while MLflow neither fails nor is slow.
