@@ -31,7 +31,7 @@ train: setup ## meta-train; its options go in ARGS: make train ARGS="--help"
 
 MODEL := ml10
 evaluate: setup ## adapt a shipped model to its new tasks, and compare with its card: make evaluate MODEL=ml45
-	$(BIN)/python -m services.evaluate $(MODEL) --expect --evaluation.episodes 10 $(ARGS)
+	$(BIN)/python -m services.evaluate $(MODEL) --expect $(ARGS)
 
 cluster: setup ## start a Ray head and an MLflow server on this machine, for Ray jobs; options go in ARGS
 	@$(BIN)/python -m services.local_cluster start $(ARGS)
