@@ -15,6 +15,7 @@ import tyro
 from dmil_core.errors import UserError
 from services.cli.arguments import parse
 from services.cli.places import announce
+from services.reporting.options import EMBEDDING_SHOTS, PERPLEXITY, SEED
 from services.storage.run_folders import find_folder
 
 if TYPE_CHECKING:
@@ -39,11 +40,11 @@ class Arguments:
     """Demonstrations to adapt to for timelines and statistics; one, as in Figure 4b."""
     rollouts: int = 3
     """Episodes to run for each run and task, before adaptation and after."""
-    embedding_shots: int = 3
+    embedding_shots: int = EMBEDDING_SHOTS
     """Demonstrations to adapt to for the t-SNE; three, as in Figure 4a."""
-    perplexity: float = 30.0
+    perplexity: float = PERPLEXITY
     """Of the t-SNE."""
-    seed: int = 0
+    seed: int = SEED
     """Of the t-SNE."""
     output: Path = Path("sub-skills.html")
     """File to write."""

@@ -6,7 +6,7 @@ The episode is run again from its row of results. With --demonstration, one that
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -15,6 +15,7 @@ from services.cli.arguments import parse
 from services.cli.places import announce
 from services.cli.progress import console
 from services.evaluation.results import EpisodeResult
+from services.reporting.options import FormName
 
 if TYPE_CHECKING:
     from services.experiments.finished_run import FinishedRun
@@ -34,7 +35,7 @@ class Arguments:
     """Demonstrations adapted to, as in the run's evaluation."""
     episode: int | None = None
     """Number of the episode, the first if not given."""
-    format: Literal["mp4", "gif"] = "mp4"
+    format: FormName = "mp4"
     """mp4, which all browsers play, or gif."""
     output: Path | None = None
     """File to write, in the run's folder report/videos if not given."""

@@ -31,8 +31,6 @@ RECENT = 50
 """Iterations behind the losses and the shares of sub-skills on the screen."""
 COLLAPSED_ITERATIONS = 100
 """Iterations that one sub-skill may take nearly all states before a warning."""
-RUN_ID_SECONDS = 60.0
-"""How long the last checkpoint waits for the MLflow run's id; the others do not."""
 
 
 class CheckpointWriter:
@@ -79,7 +77,7 @@ class CheckpointWriter:
                 "iteration": state.iteration,
                 "loss": float(np.mean(self._losses)) if self._losses else None,
                 "environment_steps": self._environment_steps,
-                "mlflow_run_id": self._tracker.wait_for_run_id(timeout=RUN_ID_SECONDS if is_last else 0.0),
+                "mlflow_run_id": self._tracker.wait_for_run_id() if is_last else self._tracker.run_id,
             }
         )
         self._path = self._checkpoints.save(state, self._constants, manifest, self._needed())

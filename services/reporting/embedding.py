@@ -11,12 +11,12 @@ from dmil_core.settings import sub_skills_of
 from services.cli.progress import Bar
 from services.reporting.choices import describe_shares, statistics
 from services.reporting.drawing import Picture, colour_of, legend_of_markers, marker_of, panels, to_picture
+from services.reporting.options import EMBEDDING_SHOTS, PERPLEXITY, SEED
 from services.reporting.page import Part, Prose, Section
 from services.reporting.run_group import RunGroup, has_sub_skills, policies
 
-SHOTS, OTHERS = 3, 16
-"""Demonstrations that the paper adapts to, and those whose states it draws."""
-PERPLEXITY, SEED = 30.0, 0
+OTHERS = 16
+"""Demonstrations whose states the paper draws, besides those that it adapts to."""
 MOST_STATES, MOST_POINTS = 800, 2000
 """So many states are embedded, a few seconds' work, and so many points drawn in all panels together."""
 IN_USE = 0.01
@@ -61,7 +61,9 @@ def embed(states: Float[np.ndarray, "states obs_dim"], perplexity: float, seed: 
     return tsne.fit_transform(states).astype(np.float32)
 
 
-def embedding_section(group: RunGroup, shots: int = SHOTS, perplexity: float = PERPLEXITY, seed: int = SEED) -> Section:
+def embedding_section(
+    group: RunGroup, shots: int = EMBEDDING_SHOTS, perplexity: float = PERPLEXITY, seed: int = SEED
+) -> Section:
     """Return a section with a picture for each task, of all runs whose methods have sub-skills.
 
     The perplexity of t-SNE is a third of the states where there are few.

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import imageio.v3 as imageio
 import matplotlib
@@ -15,10 +15,10 @@ from PIL import Image, ImageDraw, ImageFont
 from dmil_core.files import write_file
 from dmil_core.trajectories import Rollout
 from services.reporting.drawing import colour_of
+from services.reporting.options import FormName
 from services.rollouts.recording import Frame, VideoSettings
 from services.suites.rendering import View
 
-FormName = Literal["mp4", "gif"]
 FONTS = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
 PAPER, INK, FAINT, NO_SUB_SKILL = "#16181c", "#ffffff", "#b0b0b0", "#4a4d55"
 SOLVED, FAILED = "#00684a", "#9a2a00"

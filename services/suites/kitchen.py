@@ -233,7 +233,10 @@ def sub_tasks_of(task: str, field: str = "task") -> tuple[str, ...]:
 
 
 def replay(demonstration: Demonstration, *, seed: int = 0) -> tuple[str, ...]:
-    """Replay a demonstration's actions open loop from its first state; return the sub-tasks completed on the way."""
+    """Replay a demonstration's actions open loop from its first state; return the sub-tasks completed on the way.
+
+    The seed is of the environment's sensor noise, which acts on the robot too.
+    """
     env = KitchenTask(tuple(NAMES))
     _, info = env.reset(seed=seed, options={"state": resting(demonstration.observations[0])})
     for action in demonstration.actions:

@@ -33,6 +33,11 @@ def test_the_paper_preset_follows_the_paper() -> None:
     assert (paper.evaluation.shots, paper.evaluation.episodes) == ((1, 3), 20)
 
 
+def test_quick_balances_labels_where_points_are_declared() -> None:
+    balanced = {name for name, preset in PRESETS.items() if preset.method.model_dump()["balance"] == "sinkhorn"}
+    assert balanced == {"ml10-quick", "ml45-quick", "push-around-wall-quick"}
+
+
 @pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
 def test_presets_survive_json(preset: ExperimentConfig) -> None:
     assert ExperimentConfig.model_validate_json(preset.model_dump_json()) == preset
