@@ -50,7 +50,7 @@ class RelativeFeatures:
             parts += [observations[:, list(points.second_orientation)] * second_there, second_there]
         parts += [moved(observations, points.hand, points) / reach]
         if points.object is not None:
-            parts += [np.clip(moved(observations, points.object, points) / reach, -3, 3)]
+            parts += [(moved(observations, points.object, points) / reach).clip(-3, 3)]
         if self.absolute:
             parts += [hand / (LINEAR * reach)]
         return np.concatenate(parts, 1, dtype=np.float32)

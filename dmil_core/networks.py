@@ -132,7 +132,7 @@ def routed(
 
 def on_default_device(values: np.ndarray) -> Tensor:
     """Return an array as a tensor on torch's default device: on the CPU without a copy."""
-    return torch.from_numpy(values).to(torch.get_default_device())
+    return torch.as_tensor(values)
 
 
 def leaves(parameters: Parameters, *, copy: bool = False) -> dict[str, Tensor]:

@@ -1,5 +1,6 @@
 """Which numbers of an observation are positions: what a suite declares, so that a method can work with differences."""
 
+from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -68,26 +69,34 @@ class Points(Settings):
             )
 
 
+@lru_cache(maxsize=1024)
+def _columns(axes: Axes, further: int = 0) -> slice | list[int]:
+    """Return what takes these numbers out of observations, or those so much further on: a view, if it can be one."""
+    first, last = axes[0] + further, axes[-1] + further
+    together = axes == tuple(range(axes[0], axes[-1] + 1))
+    return slice(first, last + 1) if together else [axis + further for axis in axes]
+
+
 def position(
     observations: Float32[np.ndarray, "steps obs_dim"], axes: Axes | None, points: Points
 ) -> Float32[np.ndarray, "steps axes"]:
-    """Return the position of a point; that of one which is not declared is zero."""
+    """Return the position of a point, which may be a view; that of one which is not declared is zero."""
     if axes is None:
         return np.zeros((len(observations), len(points.hand)), np.float32)
-    return observations[:, list(axes)]
+    return observations[:, _columns(axes)]
 
 
 def present(
     observations: Float32[np.ndarray, "steps obs_dim"], axes: Axes | None, points: Points
 ) -> Float32[np.ndarray, "steps 1"]:
     """Return 1 where a point is there, 0 where its numbers are all zero."""
-    return np.any(position(observations, axes, points), axis=1)[:, None].astype(np.float32)
+    return (position(observations, axes, points) != 0).any(1, keepdims=True).astype(np.float32)
 
 
 def moved(
     observations: Float32[np.ndarray, "steps obs_dim"], axes: Axes, points: Points
 ) -> Float32[np.ndarray, "steps _"]:
     """Return how far some numbers moved since the step before; no numbers if an observation does not say."""
-    if points.previous is None:
+    if points.previous is None or not axes:
         return np.zeros((len(observations), 0), np.float32)
-    return observations[:, list(axes)] - observations[:, [index + points.previous for index in axes]]
+    return observations[:, _columns(axes)] - observations[:, _columns(axes, points.previous)]

@@ -29,8 +29,8 @@ COMMANDS = {
 def command_of(module: str) -> str:
     """Return how a program is called, as ``dmil report run`` or ``python -m services.report run``."""
     if module == "__main__":
-        path = Path(sys.argv[0])
-        module = f"services.{path.parent.name if path.stem == '__main__' else path.stem}"
+        spec = sys.modules["__main__"].__spec__
+        module = spec.name if spec is not None else f"services.{Path(sys.argv[0]).stem}"
     words = COMMANDS.get(module, module)
     if Path(sys.argv[0]).name != "dmil":
         return f"python -m {words}"
