@@ -13,7 +13,7 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 from dmil_core.errors import RunError, UserError, nearest
-from dmil_core.files import at_home
+from dmil_core.files import FULL, at_home
 from services.cli.escapes import for_terminal
 from services.cli.help_texts import InvalidSettingsError, command_of, describe_flags, flowing, flowing_registry
 from services.cli.progress import console_logging
@@ -109,8 +109,11 @@ def _told(error: Exception) -> str | None:
     """
     if isinstance(error, UserError | RunError):
         return str(error)
-    if not isinstance(error, OSError) or error.filename is None:
+    if not isinstance(error, OSError):
         return None
+    if error.filename is None:
+        full = f"a disk: got {error.strerror}; wanted room for what is written; make some, then start again"
+        return full if error.errno in FULL else None
     path = redacted(os.fsdecode(error.filename)) if isinstance(error.filename, str | bytes) else str(error.filename)
     return f"{path}: got {error.strerror}; wanted what can be read and written; mend that, or give another place"
 

@@ -86,7 +86,7 @@ class Checkpoints:
         ):
             for name, content in files.items():
                 create_file(made, name, content)
-        self._prune(needed)
+        self._prune(state.iteration, needed)
         return path
 
     def _sound(self) -> dict[Path, float | None]:
@@ -99,9 +99,12 @@ class Checkpoints:
                 continue
         return losses
 
-    def _prune(self, needed: Collection[Path]) -> None:
-        """Remove what is older than the newest `kept` whole checkpoints, damaged ones too, but not the best."""
-        losses = self._sound()
+    def _prune(self, newest: int, needed: Collection[Path]) -> None:
+        """Remove what is older than the newest `kept` whole checkpoints, damaged ones too, but not the best.
+
+        Those after the iteration `newest` do not count: a resume has passed them over as damaged.
+        """
+        losses = {path: loss for path, loss in self._sound().items() if iteration_of(path) <= newest}
         scored = {path: loss for path, loss in losses.items() if loss is not None and math.isfinite(loss)}
         whole, best = list(losses), min(scored, key=lambda path: scored[path], default=None)
         for path in self.all() if len(whole) > self.kept else []:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from dmil_core.errors import UserError, shorten
-from dmil_core.files import ForeignFileError, at_home, create_file, inside, making_folder
+from dmil_core.files import ForeignFileError, at_home, create_file, inside, making_folder, room_for
 
 MOST_BYTES = 255 - len(".checkpoint")
 """Of a name, as file systems have it; some room is left for names that are made of it."""
@@ -40,13 +40,15 @@ def make_folder(folder: Path, files: Mapping[str, str] | None = None) -> None:
 
     Raises:
         UserError: if its name is taken.
+        DiskFullError: for want of space.
     """
     if folder.exists():
         raise _taken(folder)
+    contents = {name: content.encode() for name, content in (files or {}).items()}
     try:
-        with making_folder(folder.parent, folder.name) as made:
-            for name, content in (files or {}).items():
-                create_file(made, name, content.encode())
+        with room_for(folder, sum(map(len, contents.values()))), making_folder(folder.parent, folder.name) as made:
+            for name, content in contents.items():
+                create_file(made, name, content)
     except FileExistsError as error:
         raise _taken(folder) from error
 

@@ -195,6 +195,18 @@ def test_a_damaged_checkpoint_does_not_count_as_kept_or_best(tmp_path: Path):
     assert [path.name[-1] for path in checkpoints.all()] == ["2", "4", "5"], "a damaged one goes with those of its age"
 
 
+def test_what_a_resume_passed_over_does_not_drive_out_what_is_saved_since(tmp_path: Path):
+    for iteration in (7, 9):
+        path = save(Checkpoints(tmp_path, kept=2), start()._replace(iteration=iteration), 0.1)
+        tensors = path / "parameters.safetensors"
+        tensors.write_bytes(tensors.read_bytes()[:-1] + b"x")  # what only a digest shows
+    checkpoints = Checkpoints(tmp_path, kept=1)
+    for iteration in (5, 6):
+        assert save(checkpoints, start()._replace(iteration=iteration), 2.0 / iteration).is_dir()
+    assert [path.name[-1] for path in checkpoints.all()] == ["6", "7", "9"]
+    assert checkpoints.newest().state.iteration == 6
+
+
 def test_a_loss_and_a_run_id_are_no_part_of_the_digest(tmp_path: Path):
     one, other = Checkpoints(tmp_path / "one", kept=1), Checkpoints(tmp_path / "other", kept=1)
     manifests = [

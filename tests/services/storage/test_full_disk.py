@@ -2,7 +2,7 @@
 
 import os
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +60,22 @@ def test_a_full_disk_stops_a_run_which_goes_on_when_there_is_space(
     meta_train.run(arguments)
     resumed = Checkpoints(small_disk / "run" / "checkpoints", 3).newest()
     assert all(map(np.array_equal, resumed.state[1:], undisturbed.state[1:]))
+
+
+def test_a_run_that_finds_no_room_for_its_folder_says_so(small_disk: Path, capsys: pytest.CaptureFixture[str]):
+    fill(small_disk, but=0)
+    runs = ("--runs", str(small_disk), "--name", "run", "--preset", "ml10-smoke", "--runner", "local")
+    assert exit_code(meta_train.run, runs) == 1
+    assert f"error: {small_disk / 'run'}: needs " in capsys.readouterr().err
+    assert [path.name for path in small_disk.iterdir()] == ["filler"]
+
+
+def test_a_full_disk_is_told_where_nothing_says_whose_it_is(capsys: pytest.CaptureFixture[str]):
+    def program(arguments: Sequence[str]) -> None:
+        Path("/dev/full").write_bytes(b"x" * 100_000)
+
+    assert exit_code(program, []) == 1
+    assert "error: a disk: got No space left on device; wanted room" in capsys.readouterr().err
 
 
 def test_no_half_of_a_data_set_or_of_rows_counts(small_disk: Path, data):
