@@ -230,7 +230,7 @@ class Evaluations:
         tallies.finish()
         self.latest = {"success": list(tallies), "after": iteration}
         rows = summary_rows(evaluation.episodes, evaluation.best_score, self._evaluator.config.method)
-        self._tracker.metrics(iteration, rates(rows, sub_skill_shares(evaluation.adaptations)))
+        self._tracker.metrics(iteration, rates(rows, sub_skill_shares(evaluation.adaptations, evaluation.episodes)))
         success_rates = "; ".join(f"{cell.split} {cell.shots}-shot {cell.success_rate:.3f}" for cell in rows)
         logger.info(f"success rates after {iteration} iterations: {success_rates}")
         if faults := faults_of(evaluation.episodes):

@@ -61,6 +61,8 @@ class EpisodeResult(_Row):
     steps: int
     sub_skill_steps: tuple[int, ...]
     """How many steps each sub-skill acted."""
+    sub_skill_switches: int | None = None
+    """In how many steps another acted than in the step before; older rows have none."""
     diverged: bool = False
     """Whether it ended because the policy's action was not finite: a failure."""
     fault: int | None = Field(default=None, exclude_if=lambda fault: fault is None)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Int
 from pydantic import BaseModel
 from rich.table import Table
 
@@ -95,6 +96,17 @@ class SubSkillShares(BaseModel):
     """Sub-skills with over a tenth of a task's states, on average over adaptations."""
     agreement: float
     """Of all states, the part where the high level takes the sub-skill that fits the demonstrated action best."""
+    in_use_per_episode: float | None = None
+    """Sub-skills that act in over a tenth of an episode's steps, on average over episodes; older files have none."""
+    switches_per_episode: float | None = None
+    """Changes of the sub-skill that acts, on average over episodes; older files have none."""
+
+    @property
+    def in_episodes(self) -> str:
+        """What there is to say of episodes, in words."""
+        if self.in_use_per_episode is None or self.switches_per_episode is None:
+            return ""
+        return f", {self.in_use_per_episode:.1f} in an episode, with {self.switches_per_episode:.1f} switches"
 
 
 class Summary(BaseModel):
@@ -193,7 +205,9 @@ def _score(rows: Sequence[EpisodeResult], best: int) -> Score:
     )
 
 
-def sub_skill_shares(adaptations: Sequence[AdaptationResult]) -> dict[Split, SubSkillShares]:
+def sub_skill_shares(
+    adaptations: Sequence[AdaptationResult], episodes: Sequence[EpisodeResult] = ()
+) -> dict[Split, SubSkillShares]:
     """Return the use of sub-skills in each split, where there are several."""
     use: dict[Split, SubSkillShares] = {}
     for split in ("meta-training", "meta-testing"):
@@ -205,10 +219,24 @@ def sub_skill_shares(adaptations: Sequence[AdaptationResult]) -> dict[Split, Sub
         use[split] = SubSkillShares(
             share=share.tolist(),
             entropy=share_entropy(share),
-            in_use_per_task=float((steps / steps.sum(1, keepdims=True) > 0.1).sum(1).mean()),
+            in_use_per_task=float(_in_use(steps).mean()),
             agreement=sum(row.agreeing for row in rows) / sum(row.steps for row in rows),
+            **_use_in_episodes([row for row in episodes if row.split == split and row.steps]),
         )
     return use
+
+
+def _in_use(steps: Int[np.ndarray, "rows sub_skills"]) -> Int[np.ndarray, " rows"]:
+    """Return how many sub-skills have over a tenth of a row's steps."""
+    return (steps / steps.sum(1, keepdims=True) > 0.1).sum(1)
+
+
+def _use_in_episodes(episodes: Sequence[EpisodeResult]) -> dict[str, float]:
+    switches = [row.sub_skill_switches for row in episodes if row.sub_skill_switches is not None]
+    if not switches:
+        return {}
+    in_use = [_in_use(np.array([row.sub_skill_steps])) for row in episodes]
+    return {"in_use_per_episode": float(np.mean(in_use)), "switches_per_episode": float(np.mean(switches))}
 
 
 def rates(rows: Sequence[SummaryRow], use: Mapping[Split, SubSkillShares]) -> dict[str, float]:
@@ -226,6 +254,8 @@ def rates(rows: Sequence[SummaryRow], use: Mapping[Split, SubSkillShares]) -> di
         metrics |= {f"task_success_rate/{name}/{task}": rate for task, rate in cell.per_task.items()}
     for split, of_split in use.items():
         metrics |= {f"agreement/{split}": of_split.agreement, f"sub_skill_entropy/{split}": of_split.entropy}
+        if (switches := of_split.switches_per_episode) is not None:
+            metrics[f"sub_skill_switches/{split}"] = switches
     return metrics
 
 
@@ -244,7 +274,7 @@ def summarise(
         environment_steps=evaluation.checkpoint.manifest.environment_steps,
         rows=summary_rows(evaluation.episodes, evaluation.best_score, config.method),
         seconds=seconds,
-        sub_skills=sub_skill_shares(evaluation.adaptations),
+        sub_skills=sub_skill_shares(evaluation.adaptations, evaluation.episodes),
         protocol=evaluation.protocol,
         seed=config.seed,
         checkpoint=str(evaluation.checkpoint.path),

@@ -67,8 +67,8 @@ def show(summary: Summary, addresses: Sequence[str] = ()) -> None:
     for split, use in summary.sub_skills.items():
         shares = ", ".join(f"{share:.2f}" for share in use.share)
         console.print(
-            f"{split}: sub-skills take {shares} of the states; {use.in_use_per_task:.1f} in use per task; "
-            f"the high level agrees with the best-fitting sub-skill on {use.agreement:.2f}"
+            f"{split}: sub-skills take {shares} of the states; {use.in_use_per_task:.1f} in use in a task"
+            f"{use.in_episodes}; the high level agrees with the best-fitting sub-skill on {use.agreement:.2f}"
         )
     if summary.collapsed:
         console.print(

@@ -52,7 +52,8 @@ def table_of_all(finished: FinishedRun) -> list[Part]:
         )
     elif use := summary.sub_skills.get("meta-testing"):
         shares = ", ".join(f"{share:.2f}" for share in use.share)
-        text = f"Sub-skills take {shares} of the states of new tasks; {use.in_use_per_task:.1f} are in use in a task."
+        text = f"Sub-skills take {shares} of the states of new tasks; {use.in_use_per_task:.1f} are in use in a task"
+        text += f"{use.in_episodes}."
         parts.append(Notice(text, SUB_SKILLS))
     if finished.has_gone_on:
         parts.append(

@@ -84,6 +84,8 @@ class EpisodeOutcome(NamedTuple):
     steps: int
     sub_skill_steps: list[int]
     """Steps in which each sub-skill acted, up to the highest one that did."""
+    sub_skill_switches: int
+    """Steps in which another sub-skill acted than in the step before."""
     diverged: bool = False
     """Whether it ended because an action was not finite."""
     fault: int | None = None
@@ -92,9 +94,10 @@ class EpisodeOutcome(NamedTuple):
     @classmethod
     def of(cls, rollout: Rollout) -> "EpisodeOutcome":
         """Leave out the trajectory."""
-        counts = np.bincount(rollout.sub_skills).tolist()
+        chosen = rollout.sub_skills
+        use = np.bincount(chosen).tolist(), int(np.count_nonzero(np.diff(chosen)))
         ended = rollout.diverged, rollout.fault
-        return cls(rollout.seed, rollout.goal, rollout.success, rollout.score, len(rollout), counts, *ended)
+        return cls(rollout.seed, rollout.goal, rollout.success, rollout.score, len(rollout), *use, *ended)
 
 
 class AdaptationOutcome(NamedTuple):

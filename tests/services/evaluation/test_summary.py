@@ -77,6 +77,20 @@ def test_sub_skill_use_is_weighted_by_states_and_counts_those_in_use() -> None:
     assert use["meta-training"].in_use_per_task == pytest.approx(1.5)
 
 
+def test_what_is_in_use_in_an_episode_and_its_switches_are_means_over_episodes() -> None:
+    of_task = [adaptation("meta-testing", (50, 50, 0), 100)]
+    old = episode("meta-testing", "reach", 1, 0, True)
+    assert not sub_skill_shares(of_task, [old])["meta-testing"].in_episodes, "older rows do not say"
+    changes = [
+        {"sub_skill_steps": (45, 5, 50), "sub_skill_switches": 4},
+        {"sub_skill_steps": (9,), "sub_skill_switches": 0},
+    ]
+    episodes = [old.model_copy(update=change) for change in changes]
+    use = sub_skill_shares(of_task, [*episodes, episode("meta-training", "push", 1, 0, True)])["meta-testing"]
+    assert (use.in_use_per_episode, use.switches_per_episode) == (1.5, 2)
+    assert use.in_episodes == ", 1.5 in an episode, with 2.0 switches"
+
+
 def test_collapse_is_entropy_zero() -> None:
     assert sub_skill_shares([adaptation("meta-testing", (0, 7, 0), 7)])["meta-testing"].entropy == 0
 
