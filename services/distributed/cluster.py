@@ -5,6 +5,7 @@ import logging
 import os
 import secrets
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Iterator
@@ -16,7 +17,7 @@ import psutil
 
 from dmil_core.errors import RunError, UserError
 from services.distributed.node_info import usable_cpus
-from services.storage.private import bypass_proxies, private_folder
+from services.storage.private import LOOPBACK, bypass_proxies, private_folder
 from services.storage.redaction import error_line, redacted
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ RunnerKind = Literal["ray", "local"]
 """Where a program works: in Ray actors, or in this process."""
 OBJECT_STORE_BYTES = 500_000_000
 SECONDS_TO_ANSWER = 20.0
+ON_NETWORK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+"""Where it is 0, Ray keeps to loopback."""
 
 
 @contextmanager
@@ -44,6 +47,8 @@ def joined(workers: int | None = None) -> Iterator[None]:
     address = named_address()
     if address is None:
         _secure_local_cluster()
+    elif _only_on_loopback(address):
+        os.environ.setdefault(ON_NETWORK, "0")  # else Ray would ask for it at this machine's address in the network
     # Ray would print every error of a call that the pool made again.
     os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")
     import ray
@@ -127,17 +132,30 @@ def named_address() -> str | None:
     return None if address in ("", "local") else address
 
 
+def _only_on_loopback(address: str) -> bool:
+    """Tell whether loopback is named, and what listens there is not at 127.0.0.2 too, as on all interfaces."""
+    host, _, port = address.rpartition(":")
+    if host not in LOOPBACK.split(","):
+        return False
+    try:
+        socket.create_connection(("127.0.0.2", int(port)), timeout=SECONDS_TO_ANSWER).close()
+    except (OSError, ValueError, OverflowError):
+        return True
+    return False
+
+
 def _join(address: str) -> None:
     """Join a cluster, if a Ray of this version answers there, with this token."""
     import ray
     from ray._private.services import canonicalize_bootstrap_address_or_die  # finds `auto`
     from ray.exceptions import RayError
 
-    host, wanted = address.removeprefix("ray://"), "wanted a Ray head that runs, as HOST:PORT, or none: unset it"
-    if "://" in host:
-        raise UserError(f"RAY_ADDRESS: got {redacted(address)}, perhaps of a dashboard, which takes jobs; {wanted}")
+    wanted = "wanted a Ray head that runs, as HOST:PORT, or none: unset it"
+    if "://" in address:
+        whose = "Ray's client" if address.startswith("ray://") else "a dashboard, which takes jobs"
+        raise UserError(f"RAY_ADDRESS: got {redacted(address)}, perhaps for {whose}; {wanted}")
     try:
-        refusal = _refusal(canonicalize_bootstrap_address_or_die(host))
+        refusal = _refusal(canonicalize_bootstrap_address_or_die(address))
         if refusal is None:
             ray.init(address, job_config=_job_config(), logging_level=logging.WARNING)
             return
@@ -191,7 +209,7 @@ def _secure_local_cluster() -> None:
     Ray reads these when it is imported, also in the processes that it starts.
     """
     os.environ.pop("RAY_ADDRESS", None)  # for Ray an empty one is set
-    os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+    os.environ.setdefault(ON_NETWORK, "0")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_AUTH_MODE", "token")
     if "RAY_AUTH_TOKEN_PATH" not in os.environ:
