@@ -42,6 +42,7 @@ OURS = {
     "RAY_AUTH_MODE": "token",
     "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # listen on loopback only
     "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_USAGE_STATS_REPORT_URL": "",  # where Ray would report that it reports none
     "RAY_JOB_STOP_WAIT_TIME_S": str(SECONDS_FOR_A_JOB),
 }
 MARK = "made-for"

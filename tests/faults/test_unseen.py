@@ -13,6 +13,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import requests
+from ray._common.usage.usage_lib import UsageReportClient, _usage_stats_report_url, generate_disabled_report_data
 
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.outer_loop import tasks_of
@@ -139,6 +141,13 @@ def test_a_run_s_own_ray_has_a_token_and_sends_no_statistics(monkeypatch):
     assert len(os.environ["RAY_AUTH_TOKEN"]) == 64
     assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
     assert local_cluster.OURS["RAY_USAGE_STATS_ENABLED"] == "0"
+
+
+def test_ray_in_a_cluster_of_ours_cannot_even_report_that_it_reports_nothing(monkeypatch):
+    for name, value in local_cluster.OURS.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(requests.exceptions.MissingSchema):
+        UsageReportClient().report_usage_data(_usage_stats_report_url(), generate_disabled_report_data())
 
 
 def test_a_job_that_is_stopped_has_time_for_its_checkpoint():
