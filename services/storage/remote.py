@@ -128,13 +128,17 @@ class Storage:
 
     def committed(self, name: str, marker: str, pattern: str) -> dict[str, bytes]:
         """Return the markers of the folders in a folder whose names match a pattern, by name, in order."""
+        markers = {own: self.get(f"{name}/{own}/{marker}", 2**20) for own in self.names(name, pattern)}
+        return {own: content for own, content in markers.items() if content is not None}
+
+    def names(self, name: str, pattern: str) -> list[str]:
+        """Return the names in a folder that match a pattern, in order."""
         try:
             listed = self._files.ls(self._path(name), detail=False)
         except FileNotFoundError:
-            return {}
-        names = sorted(path.rstrip("/").rpartition("/")[2] for path in listed)
-        markers = {own: self.get(f"{name}/{own}/{marker}", 2**20) for own in names if re.fullmatch(pattern, own)}
-        return {own: content for own, content in markers.items() if content is not None}
+            return []
+        names = (path.rstrip("/").rpartition("/")[2] for path in listed)
+        return sorted(own for own in names if re.fullmatch(pattern, own))
 
     def remove(self, name: str, marker: str) -> None:
         """Remove a folder, its marker first."""

@@ -1,9 +1,10 @@
 """A copy of a run, or of what a sweep trained, in a storage that all machines reach: another goes on from there."""
 
 import logging
+import re
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
@@ -26,6 +27,8 @@ RECORDS = (
 )  # fmt: skip
 """What else a run needs to go on, and to be looked at. The first says how far MLflow has taken the second: it is read
 before it and written after it, so that the copy never says that more was taken than it holds."""
+EVALUATIONS, EVALUATED, ROWS = "evaluations", r"\d{7,}", ("adaptations.jsonl", "episodes.jsonl")
+"""Where the rows of evaluations on the way lie, by iteration; those of episodes say that an evaluation is whole."""
 RUNS = "runs"
 CLAIM = "claim"
 """Whose a name is: the random tag of the run that has it, in its folder and in the storage."""
@@ -86,6 +89,8 @@ class Replica:
     def copy(self) -> None:
         """Bring the copy up to date: what the checkpoints' iterations measured, these, then what came after.
 
+        A copied checkpoint is gone on from: its iterations are not done again, nor are earlier ones evaluated.
+
         What the storage raises, whatever it is, passes through; the next call goes on.
 
         Raises:
@@ -93,7 +98,8 @@ class Replica:
         """
         self.claim()
         checkpoints = [path.name for path in self._checkpoints.all()]
-        self._copy_records([SPOOL])  # a copied checkpoint is gone on from, and its iterations not done again
+        evaluated = [path.name for path in sorted((self._folder / EVALUATIONS).glob("*"))]
+        self._copy_records([SPOOL, *_rows_of(name for name in evaluated if re.fullmatch(EVALUATED, name))])
         self._copy_checkpoints(checkpoints)
         self._copy_records(RECORDS)
 
@@ -158,7 +164,8 @@ class Replica:
         """
         if not self.is_ahead():
             return False
-        records = {name: self._get(name) for name in (CLAIM, *RECORDS)}
+        evaluated = self._storage.names(f"{self._name}/{EVALUATIONS}", EVALUATED)
+        records = {name: self._get(name) for name in (CLAIM, *RECORDS, *_rows_of(evaluated))}
         newer = self._newer()
         stored = self._storage.committed(f"{self._name}/checkpoints", MARKER, NAMED)
         lacking = stored.keys() - {path.name for path in self._checkpoints.all()} - set(newer)
@@ -184,6 +191,11 @@ class Replica:
         except (CheckpointError, RunError) as error:
             logger.warning(f"{self._storage.url}/{self._name}/{place}: not taken: {error_line(error)}")
             return False
+
+
+def _rows_of(evaluated: Iterable[str]) -> list[str]:
+    """Return the files with an evaluation's rows, those that say that it is whole last."""
+    return [f"{EVALUATIONS}/{iteration}/{file}" for iteration in evaluated for file in ROWS]
 
 
 def _state(path: Path) -> tuple[float, int]:

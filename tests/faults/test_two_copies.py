@@ -63,6 +63,18 @@ def test_older_checkpoints_are_fetched_too_and_stay_there(copied: tuple[Path, Pa
     assert len(before) == 2
 
 
+def test_what_was_evaluated_on_the_way_is_fetched_too(train: Callable[..., Path], workplace: Path, monkeypatch):
+    store = workplace / "storage"
+    monkeypatch.setenv(STORAGE, store.as_uri())
+    folder = train("run", "--evaluation.every", "2", "--training.checkpoints-kept", "1")
+    rows = {path.relative_to(folder): path.read_bytes() for path in folder.glob("evaluations/*/*.jsonl")}
+    assert len(rows) >= 2, "the first checkpoint is gone, so nothing can be evaluated there again"
+    (store / "runs" / "run" / "evaluations" / ".DS_Store").write_text("not ours")
+    shutil.rmtree(folder)
+    assert restored(folder)
+    assert {path.relative_to(folder): path.read_bytes() for path in folder.glob("evaluations/*/*.jsonl")} == rows
+
+
 def test_what_is_damaged_there_is_not_taken_and_not_kept(copied: tuple[Path, Path], logged):
     here, there = copied
     whole = newest(here)
