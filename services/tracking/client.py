@@ -10,6 +10,7 @@ from requests.adapters import HTTPAdapter
 
 from dmil_core.errors import RunError
 from services.storage.private import bypass_proxies
+from services.tracking.links import database
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -36,8 +37,13 @@ def set_mlflow_defaults() -> None:
 
 
 def connect(uri: str) -> "MlflowClient":
-    """Return a client of the MLflow at `uri`, whose answers are read up to `MOST_BYTES` and no longer than minutes."""
+    """Return a client of the MLflow at `uri`, whose answers are read up to `MOST_BYTES` and no longer than minutes.
+
+    Raises:
+        RunError: if it is a file that cannot be there.
+    """
     set_mlflow_defaults()
+    _check_place(uri)
     from mlflow import MlflowClient  # takes seconds to import: not before it is needed
     from mlflow.utils import request_utils
 
@@ -45,6 +51,18 @@ def connect(uri: str) -> "MlflowClient":
     if not issubclass(adapter, BoundedAnswers):
         request_utils.TCPKeepAliveHTTPAdapter = type("BoundedAdapter", (BoundedAnswers, adapter), {})
     return MlflowClient(uri)
+
+
+def _check_place(uri: str) -> None:
+    """Refuse a file that SQLite cannot open: MLflow would try again and again for minutes."""
+    file = database(uri)
+    if file is None:
+        return
+    there = next(place for place in (file, *file.absolute().parents) if os.path.exists(place))  # noqa: PTH110
+    if (there == file) == there.is_dir():
+        raise RunError(f"{there} is {'a' if there == file else 'no'} folder")
+    if not os.access(there, os.R_OK if there == file else os.W_OK):
+        raise RunError(f"{there} cannot be {'read' if there == file else 'written to'}")
 
 
 class BoundedAnswers(HTTPAdapter):

@@ -142,3 +142,12 @@ def test_neither_a_proxy_nor_another_server_receives_the_token(serve, name: str,
     monkeypatch.setenv(name, f"http://127.0.0.1:{proxy.port}")
     assert connect(f"http://127.0.0.1:{mlflow.port}").get_experiment_by_name("x")
     assert (mlflow.logins, other.logins, proxy.logins) == (["Bearer SECRET"], [None], [])
+
+
+@pytest.mark.parametrize(("name", "why"), [("folder", "folder is a folder"), ("file/mlflow.db", "file is no folder")])
+def test_a_database_that_cannot_be_there_is_told_at_once(tmp_path: Path, name: str, why: str):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(RunError, match=why):
+        connect(f"sqlite:///{tmp_path / name}")
+    connect(f"sqlite:///{tmp_path / 'made' / 'mlflow.db'}")
