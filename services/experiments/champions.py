@@ -121,7 +121,8 @@ class Promotion:
         if self.champion_checkpoint is None:
             return
         ours, theirs = self.experiment.config, self.champion_checkpoint.manifest.config
-        fine_tuning = {name: getattr(theirs.evaluation, name) for name in ("fine_tuning_steps", "learning_rate")}
+        names = ("fine_tuning_steps", "learning_rate", "optimiser", "displaced")
+        fine_tuning = {name: getattr(theirs.evaluation, name) for name in names}
         config = theirs.model_copy(
             update={
                 "seed": ours.seed,  # names the episodes

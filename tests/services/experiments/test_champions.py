@@ -12,6 +12,7 @@ from dmil_core.errors import RunError
 from services import evaluate, meta_train
 from services.demonstrations.store import DemoStore
 from services.evaluation.comparison import Difference
+from services.evaluation.results import EpisodeResult, read_rows
 from services.experiments.champions import is_better
 from services.tracking.__main__ import run as tracking_program
 from services.tracking.ownership import IDENTITY
@@ -20,6 +21,7 @@ from tests.services.programs import Server
 
 NAME = "ml10-part"
 TASKS = ("--suite.train-tasks", "drawer-close", "--suite.test-tasks", "door-close")
+OPTIMISERS = {"behaviour-cloning": "adam", "nearest-neighbour": "sgd"}
 EVALUATION = ("--evaluation.shots", "1", "--evaluation.episodes", "2")
 
 
@@ -34,10 +36,10 @@ def runs(
         environment.chdir(runs)
         environment.setenv("DMIL_DATA", str(store.root))
         environment.setenv("MLFLOW_TRACKING_URI", f"http://127.0.0.1:{free_port()}")
-        for method in ("behaviour-cloning", "nearest-neighbour"):
+        for method in OPTIMISERS:
             arguments = ["--preset", "ml10-smoke", "--method", method, "--runner", "local", "--name", method]
-            iterations = ["--training.iterations", "0"]
-            meta_train.run([*arguments, *TASKS, *iterations, *EVALUATION, "--runs", str(runs)])
+            arguments += ["--training.iterations", "0", "--evaluation.optimiser", OPTIMISERS[method]]
+            meta_train.run([*arguments, *TASKS, *EVALUATION, "--runs", str(runs)])
         environment.setenv("MLFLOW_TRACKING_URI", mlflow_server.uri)
         yield {"worse": runs / "behaviour-cloning", "better": runs / "nearest-neighbour"}
 
@@ -56,7 +58,9 @@ def promote(runs: Mapping[str, Path], tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.thorough
-def test_the_alias_moves_to_what_is_better_outside_its_interval_only(promote, runs: Mapping[str, Path], complaint):
+def test_the_alias_moves_to_what_is_better_outside_its_interval_only(
+    promote, runs: Mapping[str, Path], complaint, tmp_path: Path
+):
     arguments = ["--runner", "local", "--promote"]
     message = complaint(evaluate.run, "--checkpoint", str(runs["worse"]), *arguments)
     assert "which has no MLflow run; wanted the last checkpoint of a finished run" in message
@@ -67,6 +71,8 @@ def test_the_alias_moves_to_what_is_better_outside_its_interval_only(promote, ru
     assert promote("worse") == [f"{NAME}: version 1 is the first champion"]
     assert promote("worse") == [f"{NAME}: version 1 is the champion already"]
     pair, decision = promote("better")
+    (champion,) = tmp_path.glob("*/champion/episodes.jsonl")
+    assert {row.optimiser for row in read_rows(champion, EpisodeResult)} == {"adam"}
     assert pair == (
         "version 2 against version 1, meta-testing 1-shot: +1.000 "
         "(95% interval +1.000 to +1.000; 2 pairs of episodes), higher? yes, higher"
