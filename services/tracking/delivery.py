@@ -222,7 +222,7 @@ class Delivery:
         ends = [line.end for line in islice(read_spool(path), count)]
         if len(ends) < count:
             raise UserError(
-                f"{self._folder / 'mlflow_run.json'}: got {count} records delivered; wanted at most the {len(ends)} of "
+                f"{self._folder / IDENTITY}: got {count} records delivered; wanted at most the {len(ends)} of "
                 f"{path}: restore the two together"
             )
         return ends[-1] if ends else 0

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch
 from mlflow.models import set_model
 from mlflow.pyfunc.model import PythonModel, PythonModelContext
 
@@ -32,7 +31,7 @@ class Imitator(PythonModel):
         checkpoint = Checkpoint(Path(context.artifacts["checkpoint"]))
         self._action_dim: int = context.model_config["action_dim"]
         self._method = checkpoint.method(self._action_dim)
-        self._parameters = {name: torch.tensor(array) for name, array in checkpoint.parameters.items()}
+        self._parameters = checkpoint.tensors()
         self._evaluation = checkpoint.manifest.config.evaluation
         self.policies: dict[tuple[str, FineTuning], Policy] = {}
 

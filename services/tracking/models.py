@@ -10,7 +10,7 @@ from dmil_core.configs import EvaluationConfig
 from dmil_core.errors import UserError
 from dmil_core.files import copy_plain, inside
 from services.storage.redaction import error_line, redacted
-from services.tracking.client import connect
+from services.tracking.client import connect, set_mlflow_defaults
 from services.tracking.links import tracking_uri
 from services.tracking.ownership import check_model
 
@@ -67,14 +67,15 @@ def checkpoint_at(address: str) -> Checkpoint:
     Raises:
         UserError: if there is none, or MLflow does not answer.
     """
-    uri = tracking_uri()
-    client = connect(uri)
+    set_mlflow_defaults()
     from mlflow.exceptions import MlflowException
 
+    uri = tracking_uri()
     with tempfile.TemporaryDirectory() as made:
         try:
+            client = connect(uri)
             return Checkpoint(download(client, uri, _model_at(client, address), Path(made)))
-        except (MlflowException, OSError, IndexError) as error:
+        except (MlflowException, OSError, LookupError) as error:
             raise UserError(
                 f"{address}: got no model at {redacted(uri)}: {error_line(error)}; wanted models:/NAME@ALIAS, "
                 "models:/NAME/VERSION, models:/ID or runs:/RUN_ID/model; set MLFLOW_TRACKING_URI to the run's"

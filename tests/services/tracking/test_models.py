@@ -8,7 +8,6 @@ from typing import Any
 import mlflow
 import numpy as np
 import pytest
-import torch
 from mlflow import MlflowClient
 from mlflow.artifacts import download_artifacts
 from mlflow.pyfunc.model import PythonModelContext
@@ -57,7 +56,7 @@ def untrained(store: DemoStore, data, tmp_path: Path, no_mlflow: None, monkeypat
 def policy_of(checkpoint: Checkpoint, support):
     """Return the policy that the method itself adapts to a support set."""
     method = checkpoint.method(support[0].actions.shape[1])
-    return method.adapt({name: torch.tensor(a) for name, a in checkpoint.parameters.items()}, support, STEPS)
+    return method.adapt(checkpoint.tensors(), support, STEPS)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +77,8 @@ def test_it_acts_as_the_adapted_policy_step_by_step(untrained, kind: type[Imitat
         decision = policy.act(observation[None], memory)
         asked = packed(support, observation) | {"memory": remembered}
         answer = imitator.answer(asked, STEPS)
-        np.testing.assert_array_equal(np.float32(answer["action"]), decision.actions[0])
+        rounding = 0 if kind is Imitator else 1e-5  # version 0.1 laid its parameters out in another order
+        np.testing.assert_allclose(np.float32(answer["action"]), decision.actions[0], rounding)
         assert answer["sub_skill"] == decision.sub_skills[0]
         if "support_id" in answer:
             by_id = imitator.answer(asked | {"support": None, "support_id": answer["support_id"]}, STEPS)
@@ -119,6 +119,10 @@ def test_mlflow_loads_it_without_pickle_and_predicts(untrained, own_mlflow: str,
         assert dmil.load(address).checkpoint.digest == checkpoint.digest
     with pytest.raises(UserError, match=r"nobody@champion: got no model at sqlite:.*; wanted models:/NAME@"):
         dmil.load("models:/nobody@champion")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "nowhere://models")
+    with pytest.raises(UserError, match=r"got no model at nowhere:.*unsupported"):
+        dmil.load("models:/nobody@champion")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", own_mlflow)
 
     observation = support[0].observations[5]
     params = {"fine_tuning_steps": STEPS.steps, "learning_rate": STEPS.learning_rate}
