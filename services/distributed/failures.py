@@ -4,11 +4,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from dmil_core.configs import ExperimentConfig
-from dmil_core.errors import RunError, UserError, WorkError
-from dmil_core.files import named, read_file, write_file
+from dmil_core.errors import RunError, WorkError
+from dmil_core.files import named, read_json, write_file
 from services.storage.provenance import library_versions
 
 MOST_BYTES = 10_000_000
@@ -64,11 +64,8 @@ def read_failure(path: Path) -> Failure:
     """Read ``failure.json``, or that of a folder.
 
     Raises:
-        UserError: if there is none.
+        UserError: if there is none, or it is damaged.
     """
     if path.is_dir():
         path = path / "failure.json"
-    try:
-        return Failure.model_validate_json(read_file(*named(path), MOST_BYTES))
-    except (OSError, ValidationError) as error:
-        raise UserError(f"{path}: got {error}; wanted a failure.json that a program left behind") from error
+    return read_json(*named(path), Failure, MOST_BYTES, "wanted a failure.json that a program left behind")

@@ -1,5 +1,6 @@
 """A run that has come to its end, read back from its folder."""
 
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -159,4 +160,5 @@ class FinishedRun(EvaluationFolder):
     def demonstrations(self) -> dict[str, TaskDemonstrations]:
         """Every task's, collected again where the store has lost them."""
         only = {row.task for row in self.episodes} if self.is_evaluation else None
-        return self.experiment.collect(LocalRunner(self.experiment.suite), only)
+        with closing(LocalRunner(self.experiment.suite)) as runner:
+            return self.experiment.collect(runner, only)

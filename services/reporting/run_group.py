@@ -1,6 +1,7 @@
 """Several runs of one kind of robot on the same tasks, and their policies before and after adaptation."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -73,7 +74,8 @@ def group_runs(runs: Mapping[str, FinishedRun], tasks: Sequence[str] | None = No
     else:
         suite = run.config.suite.model_copy(update={"test_tasks": wanted})
         experiment = Experiment(run.config.model_copy(update={"suite": suite}), run.experiment.store)
-        data = experiment.collect(LocalRunner(experiment.suite))
+        with closing(LocalRunner(experiment.suite)) as runner:
+            data = experiment.collect(runner)
     held_out = experiment.held_out_sets(data)
     return RunGroup(runs, experiment, {task: held_out[task] for task in wanted})
 

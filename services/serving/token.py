@@ -22,7 +22,7 @@ def given_token() -> str | None:
         path, source = os.environ.get(TOKEN_PATH), TOKEN_PATH
         if not path:
             return None
-        token = read_file(*named(Path(path)), MOST_BYTES).decode().strip()
+        token = read_file(*named(Path(path)), MOST_BYTES).decode("utf-8", "replace").strip()
     if len(token) < LEAST or not token.isascii() or not token.isprintable() or " " in token:
         raise UserError(
             f"{source}: got {len(token)} characters; wanted at least {LEAST} of ASCII without spaces, as `openssl rand "
