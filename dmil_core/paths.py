@@ -1,4 +1,4 @@
-"""The way of the hand in a demonstration, and how it moves where object and goal are elsewhere."""
+"""The path of the hand in a demonstration, and how it shifts when object and goal are displaced."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -12,9 +12,16 @@ from dmil_core.points import Axes, Points, position, present
 from dmil_core.seeding import named_rng
 
 MOVED = 1.0
-"""An object has moved when it is so far from its first place, in units of the hand's reach in a step."""
+"""Distance from its first position at which an object counts as moved, in units of the hand's reach in a step."""
 ARRIVED = 0.7
-"""Part of the way after contact on which the goal takes over from the object."""
+"""Fraction of the path after contact over which the goal takes over from the object."""
+RADIUS = 10.0
+"""Largest displacement of object and goal in each horizontal direction, in units of the hand's reach in a step: 10 cm
+where that is 1 cm."""
+LEAD = 1.4
+"""The hand has the whole displacement after 1/1.4 of its path to the contact; it starts from where it did."""
+TIMES = 4
+"""How many times each undisplaced demonstration is repeated beside its displaced copies."""
 
 
 def contact(demonstration: Demonstration, points: Points) -> int:
@@ -24,44 +31,35 @@ def contact(demonstration: Demonstration, points: Points) -> int:
     return int(moved.argmax()) if moved.any() else len(demonstration)
 
 
-def way(demonstration: Demonstration, points: Points) -> Float32[np.ndarray, " steps"]:
-    """Return how far the hand has gone at each step."""
+def travelled(demonstration: Demonstration, points: Points) -> Float32[np.ndarray, " steps"]:
+    """Return the length of the hand's path up to each step, in the unit of its position."""
     hand = position(demonstration.observations, points.hand, points)
     return np.r_[0, np.linalg.norm(np.diff(hand, axis=0), axis=1)].cumsum().astype(np.float32)
 
 
 def goal_weight(demonstration: Demonstration, points: Points) -> Float32[np.ndarray, " steps"]:
-    """Return how much the goal's displacement, in place of the object's, moves the path at each step, from 0 to 1.
+    """Return the weight of the goal's displacement, against the object's, in that of the path at each step.
 
-    Where the object never moves the goal is all there is to go to, from the first step on; where no goal is seen, the
-    path stays with the object.
+    It is 0 until contact, and then rises to 1 with the path travelled. If the object never moves, it rises from the
+    first step on; if no goal is seen, it stays 0.
     """
     if not present(demonstration.observations, points.goal, points).all():
         return np.zeros(len(demonstration), np.float32)
-    begun, gone = contact(demonstration, points), way(demonstration, points)
-    begun = 0 if begun == len(demonstration) else begun
-    at_contact = gone[min(begun, len(gone) - 1)]
-    share = (gone - at_contact) / max(ARRIVED * (gone[-1] - at_contact), 0.1 * points.reach)
-    return np.where(np.arange(len(gone)) < begun, 0, np.clip(share, 0, 1)).astype(np.float32)
-
-
-RADIUS = 10.0
-"""How far object and goal are displaced at most in each horizontal direction, in units of the hand's reach in a step:
-10 cm where that is 1 cm."""
-LEAD = 1.4
-"""The hand has all of the displacement after 1/1.4 of its way to the contact: it begins where it did."""
-TIMES = 4
-"""How often each demonstration itself stands beside its displaced copies."""
+    steps, distance = len(demonstration), travelled(demonstration, points)
+    touched = contact(demonstration, points) % steps  # 0 if never
+    share = (distance - distance[touched]) / max(ARRIVED * (distance[-1] - distance[touched]), 0.1 * points.reach)
+    return np.where(np.arange(steps) < touched, 0, np.clip(share, 0, 1)).astype(np.float32)
 
 
 def displaced(demonstration: Demonstration, points: Points, rng: np.random.Generator) -> Demonstration:
-    """Return what the demonstration could have been with object and goal elsewhere.
+    """Return the demonstration as it could have been with object and goal at other positions, drawn from `rng`.
 
-    The path of the hand, and the actions with it, follow the object until contact and the goal after it; half of the
-    time both are displaced alike. The last number of a position, its height, stays.
+    The path of the hand, and the actions with it, follow the object until contact and the goal after it. With
+    probability 1/2 object and goal have the same displacement. Heights, the last number of a position, are unchanged.
     """
-    steps, begun, gone = len(demonstration), contact(demonstration, points), way(demonstration, points)
-    until = np.clip(LEAD * gone / max(gone[min(begun, steps - 1)], 0.1 * points.reach), 0, 1)[:, None]
+    steps, touched = len(demonstration), contact(demonstration, points)
+    distance = travelled(demonstration, points)
+    until = np.clip(LEAD * distance / max(distance[min(touched, steps - 1)], 0.1 * points.reach), 0, 1)[:, None]
     weight = goal_weight(demonstration, points)[:, None]
 
     def draw() -> np.ndarray:
@@ -71,7 +69,7 @@ def displaced(demonstration: Demonstration, points: Points, rng: np.random.Gener
     of_goal = of_object if rng.random() < 0.5 else draw()
     together = (1 - weight) * of_object + weight * of_goal
     of_path = until * together
-    held = np.where(np.arange(steps)[:, None] < begun, of_object, together)
+    held = np.where(np.arange(steps)[:, None] < touched, of_object, together)
     observations, actions = demonstration.observations.copy(), demonstration.actions.copy()
 
     def move(axes: Axes | None, shift: np.ndarray, *, also_before: bool = True) -> None:
@@ -93,9 +91,9 @@ def displaced(demonstration: Demonstration, points: Points, rng: np.random.Gener
 
 
 def with_copies(support: Sequence[Demonstration], points: Points | None, copies: int) -> Sequence[Demonstration]:
-    """Return the support set and about `copies` displaced copies, shared between its demonstrations.
+    """Return the support set with `copies` displaced copies, rounded up to as many of each demonstration.
 
-    The demonstrations themselves come `TIMES` over, so that copies do not drown them.
+    The demonstrations themselves are repeated `TIMES` times, so that the copies do not outweigh them.
 
     Raises:
         UserError: for copies where no object is declared.

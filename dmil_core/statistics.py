@@ -71,41 +71,42 @@ def share_entropy(shares: Float[np.ndarray, " sub_skills"]) -> float:
 
 
 BOOTSTRAP_DRAWS = 2000
+"""Resamples behind an interval."""
 
 
 def stratified_bootstrap(
-    outcomes: Float[np.ndarray, "seeds tasks episodes"], draw: np.random.Generator, confidence: float = 0.95
+    outcomes: Float[np.ndarray, "seeds tasks episodes"], rng: np.random.Generator, confidence: float = 0.95
 ) -> Mean:
-    """Return the mean outcome with its percentile interval (Efron and Tibshirani 1993).
+    """Return the mean outcome with its percentile bootstrap interval (Efron and Tibshirani 1993).
 
-    Seeds are drawn with replacement, then for each of them the episodes of each task: so the interval covers what
-    training and what the episodes have to do with chance, while every task keeps its weight. Differences of paired
-    episodes are outcomes too.
+    Seeds are resampled with replacement, and then, for each of them, the episodes of each task. So the interval covers
+    the randomness of training and of episodes, while every task keeps its weight. An outcome may also be the difference
+    of two paired episodes.
     """
     seeds, tasks, episodes = outcomes.shape
     means = np.zeros((BOOTSTRAP_DRAWS, seeds))
     for place in range(seeds):
-        chosen = outcomes[draw.integers(seeds, size=BOOTSTRAP_DRAWS)]
-        again = draw.integers(episodes, size=(BOOTSTRAP_DRAWS, tasks, episodes))
+        chosen = outcomes[rng.integers(seeds, size=BOOTSTRAP_DRAWS)]
+        again = rng.integers(episodes, size=(BOOTSTRAP_DRAWS, tasks, episodes))
         means[:, place] = np.take_along_axis(chosen, again, axis=2).mean((1, 2))
     low, high = np.quantile(means.mean(1), [(1 - confidence) / 2, (1 + confidence) / 2])
     return Mean(float(outcomes.mean()), float(low), float(high), outcomes.size)
 
 
 def nested_bootstrap(
-    outcomes: Sequence[Sequence[Sequence[float]]], draw: np.random.Generator, confidence: float = 0.95
+    outcomes: Sequence[Sequence[Sequence[float]]], rng: np.random.Generator, confidence: float = 0.95
 ) -> Mean:
-    """Return the mean outcome with the percentile interval that resamples tasks, their support sets, their episodes.
+    """Return the mean outcome with its percentile bootstrap interval, resampling tasks, support sets, then episodes.
 
-    Outcomes are by task and support set; differences of paired episodes are outcomes too.
+    `outcomes` are lists by task, support set and episode; one may also be the difference of two paired episodes.
     """
     means = []
     for _ in range(BOOTSTRAP_DRAWS):
         of_tasks = []
-        for task in draw.integers(len(outcomes), size=len(outcomes)):
+        for task in rng.integers(len(outcomes), size=len(outcomes)):
             sets = outcomes[task]
-            drawn = [np.array(sets[number]) for number in draw.integers(len(sets), size=len(sets))]
-            again = [episodes[draw.integers(len(episodes), size=len(episodes))] for episodes in drawn]
+            drawn = [np.array(sets[number]) for number in rng.integers(len(sets), size=len(sets))]
+            again = [episodes[rng.integers(len(episodes), size=len(episodes))] for episodes in drawn]
             of_tasks.append(np.concatenate(again).mean())
         means.append(np.mean(of_tasks))
     low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
@@ -130,15 +131,15 @@ def performance_profile(
 def profile_band(
     runs: Float[np.ndarray, "seeds tasks"],
     thresholds: Float[np.ndarray, " thresholds"],
-    draw: np.random.Generator,
+    rng: np.random.Generator,
     confidence: float = 0.95,
 ) -> tuple[Float[np.ndarray, " thresholds"], Float[np.ndarray, " thresholds"]]:
     """Return the lower and upper end of a profile's percentile band, threshold by threshold.
 
-    Runs are drawn with replacement and every task keeps its weight. One training serves all tasks, so all runs of a
-    seed are drawn together; Agarwal et al. draw those of each task for themselves, as where each had its own training.
+    Seeds are resampled with replacement, each with its runs on all tasks: one training serves them all. Agarwal et al.
+    resample the runs of each task separately, for there each run is a training of its own.
     """
-    again = runs[draw.integers(len(runs), size=(BOOTSTRAP_DRAWS, len(runs)))]
+    again = runs[rng.integers(len(runs), size=(BOOTSTRAP_DRAWS, len(runs)))]
     # Threshold by threshold: all at once would be draws x runs x thresholds numbers.
     profiles = np.stack([performance_profile(again, thresholds[i : i + 1])[:, 0] for i in range(len(thresholds))], 1)
     low, high = np.quantile(profiles, [(1 - confidence) / 2, (1 + confidence) / 2], axis=0)
