@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dmil_core.losses import Steps, squared_errors
-from dmil_core.networks import Adam, Layer, Network, cosine_rate, descend
+from dmil_core.networks import Adam, Network, cosine_rate, descend, each_tensor
 from dmil_core.settings import FineTuning
 
 BATCH = 128
@@ -30,12 +30,12 @@ def on_batches(networks: Sequence[Network], loss: Callable[[Steps], Tensor], ste
 
 def free(network: Network) -> Network:
     """Return a copy of a network whose tensors ask for gradients."""
-    return tuple(Layer(*(tensor.detach().clone().requires_grad_() for tensor in layer)) for layer in network)
+    return each_tensor(network, lambda tensor: tensor.detach().clone().requires_grad_())
 
 
 def fixed(network: Network) -> Network:
     """Return a network without graph; no copy."""
-    return tuple(Layer(*(tensor.detach() for tensor in layer)) for layer in network)
+    return each_tensor(network, torch.Tensor.detach)
 
 
 def mean_error(

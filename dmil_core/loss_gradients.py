@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dmil_core.losses import OutputLoss
-from dmil_core.networks import Layer, Network, activations, add_product, affine, blocks
+from dmil_core.networks import Network, activations, add_product, affine, blocks, each_tensor
 
 _relu_backward = torch.ops.aten.threshold_backward.grad_input
 
@@ -42,7 +42,7 @@ class LossGradient(NamedTuple):
 
     def descend(self, learning_rate: float, *, in_place: bool = False) -> Network:
         """Return the network after one step of gradient descent; with `in_place`, `self.network` is overwritten."""
-        stepped = self.network if in_place else tuple(Layer(*map(torch.clone, layer)) for layer in self.network)
+        stepped = self.network if in_place else each_tensor(self.network, torch.clone)
         self.add_to(stepped, -learning_rate)
         return stepped
 

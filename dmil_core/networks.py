@@ -6,7 +6,7 @@ networks along the first axis of every tensor; `bank` and `network` give views o
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -53,6 +53,20 @@ def network(parameters: Parameters, prefix: str) -> Network:
     """Return the layers of the network whose names begin with `prefix` and a dot; no copy."""
     tensors = [tensor for name, tensor in parameters.items() if name.startswith(f"{prefix}.")]
     return tuple(map(Layer, tensors[::2], tensors[1::2]))
+
+
+def parameters_of(network: Network, prefix: str) -> dict[str, Tensor]:
+    """Return the named parameters of a network, or of a bank's stacked layers: the inverse of `network`; no copy."""
+    return {
+        f"{prefix}.{index}.{name}": tensor
+        for index, layer in enumerate(network)
+        for name, tensor in layer._asdict().items()
+    }
+
+
+def each_tensor(network: Network, change: Callable[[Tensor], Tensor]) -> Network:
+    """Return a network of what a function returns for each weight and bias."""
+    return tuple(Layer(*map(change, layer)) for layer in network)
 
 
 def bank(parameters: Parameters, prefix: str) -> tuple[Network, ...]:

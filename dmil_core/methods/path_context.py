@@ -25,9 +25,9 @@ from dmil_core.loss_gradients import LossGradient, loss_gradient
 from dmil_core.losses import differentiated, squared_errors
 from dmil_core.methods.base import Method, TaskGradient
 from dmil_core.networks import (
-    Layer,
     Network,
     Parameters,
+    each_tensor,
     initialise,
     mlp,
     network,
@@ -242,7 +242,7 @@ def path_gradients(network: Network, batches: Sequence[PathBatch], view: PathVie
         shares = of_each[..., -1:].masked_fill(absent[:, None, :, None], -torch.inf).softmax(2)
         return ((of_each[..., :-1] * shares).sum(2) - actions).square().sum(-1).mean(-1)
 
-    copies = tuple(Layer(*(tensor.expand(len(batches), *tensor.shape) for tensor in layer)) for layer in network)
+    copies = each_tensor(network, lambda tensor: tensor.expand(len(batches), *tensor.shape))
     return loss_gradient(copies, rows, lambda outputs: differentiated(loss, outputs))
 
 
@@ -316,7 +316,7 @@ def with_path_gradients(
         return list(results)
     layers, paths = network(without_graph(parameters), "path"), [batch.path for batch in batches if batch.path]
     of_path = path_gradients(layers, paths, view)
-    vector = tuple(Layer(*(tensor.new_zeros(len(paths), *tensor.shape) for tensor in layer)) for layer in layers)
+    vector = each_tensor(layers, lambda tensor: tensor.new_zeros(len(paths), *tensor.shape))
     of_path.add_to(vector)
     shapes = {name: tensor.shape for name, tensor in parameters.items()}
     for index, result in enumerate(results):

@@ -14,7 +14,18 @@ from dmil_core.loss_gradients import LossGradient, loss_gradient
 from dmil_core.losses import Steps, bank_errors, behaviour_cloning_loss, squared_errors, sub_skill_labels
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.dmil.losses import Targets, hard_labels, high_level_loss, targets_of
-from dmil_core.networks import Network, Parameters, bank, mlp, network, own_states, routed, stacked, without_graph
+from dmil_core.networks import (
+    Network,
+    Parameters,
+    bank,
+    mlp,
+    network,
+    own_states,
+    parameters_of,
+    routed,
+    stacked,
+    without_graph,
+)
 from dmil_core.settings import FineTuning
 
 
@@ -33,13 +44,7 @@ class Hierarchy(NamedTuple):
     @property
     def parameters(self) -> Parameters:
         """The named parameters, the sub-skills stacked into a bank."""
-        levels = {"high": self.high, "low": stacked(self.low)}
-        return {
-            f"{level}.{index}.{name}": tensor
-            for level, layers in levels.items()
-            for index, layer in enumerate(layers)
-            for name, tensor in layer._asdict().items()
-        }
+        return {**parameters_of(self.high, "high"), **parameters_of(stacked(self.low), "low")}
 
 
 class InnerStep(NamedTuple):

@@ -18,7 +18,7 @@ from dmil_core.losses import OutputLoss, Steps, differentiated
 from dmil_core.methods.base import TaskGradient
 from dmil_core.methods.dmil.config import DmilConfig
 from dmil_core.methods.dmil.losses import hard_labels, pair_weights, switching, targets_of
-from dmil_core.networks import Layer, Network, Parameters, mlp, network, without_graph
+from dmil_core.networks import Network, Parameters, each_tensor, mlp, network, parameters_of, without_graph
 
 
 class TaskSteps(NamedTuple):
@@ -67,24 +67,17 @@ class Levels(NamedTuple):
         parameters = without_graph(parameters)
         high, low = (network(parameters, level) for level in ("high", "low"))
         return cls(
-            tuple(Layer(*(tensor.repeat(tasks, *[1] * tensor.ndim) for tensor in layer)) for layer in high),
-            tuple(Layer(*(tensor.repeat(tasks, *[1] * (tensor.ndim - 1)) for tensor in layer)) for layer in low),
+            each_tensor(high, lambda tensor: tensor.repeat(tasks, *[1] * tensor.ndim)),
+            each_tensor(low, lambda tensor: tensor.repeat(tasks, *[1] * (tensor.ndim - 1))),
         )
 
     def zeros(self) -> "Levels":
         """Return zeros in the place of all parameters."""
-        high, low = (tuple(Layer(*map(torch.zeros_like, layer)) for layer in level) for level in self)
-        return Levels(high, low)
+        return Levels(each_tensor(self.high, torch.zeros_like), each_tensor(self.low, torch.zeros_like))
 
     def flat(self, tasks: int, like: Parameters) -> Float[Tensor, "tasks size"]:
         """Return each task's numbers as `dmil_core.networks.flatten` has them; zeros for parameters of other names."""
-        parts = []
-        named = {
-            f"{level}.{index}.{name}": tensor
-            for level, layers in self._asdict().items()
-            for index, layer in enumerate(layers)
-            for name, tensor in layer._asdict().items()
-        }
+        parts, named = [], {**parameters_of(self.high, "high"), **parameters_of(self.low, "low")}
         for name, parameter in like.items():
             tensor = named.get(name)
             if tensor is None:

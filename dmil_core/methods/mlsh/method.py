@@ -21,12 +21,13 @@ from dmil_core.seeding import named_rng
 
 def _actors(parameters: Parameters) -> tuple[Network, ...]:
     """Return the sub-skills of a bank without their values."""
+    return tuple(map(_without_value, bank(without_graph(parameters), "low")))
 
-    def of(sub_skill: Network) -> Network:
-        *hidden, output = sub_skill
-        return (*hidden, Layer(output.weight[:-1], output.bias[:-1]))
 
-    return tuple(map(of, bank(without_graph(parameters), "low")))
+def _without_value(network: Network) -> Network:
+    """Return a network without its last output."""
+    *hidden, output = network
+    return (*hidden, Layer(output.weight[:-1], output.bias[:-1]))
 
 
 @dataclass(frozen=True)
@@ -78,19 +79,18 @@ class Mlsh(MetaLearner[MlshConfig, DemonstrationBatch]):
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> MlshPolicy:
         """Learn a fresh high level on the support set, its steps being updates; the sub-skills stay as they are."""
         steps, low = Steps.of(support, self.normalise), _actors(parameters)
-        random = named_rng(0, "mlsh", "adapt")
-        high = self._fresh_high(random, fine_tuning.learning_rate)
-        task = TaskLearning(steps, self.config, torch.Generator().manual_seed(int(random.integers(2**63))))
+        rng = named_rng(0, "mlsh", "adapt")
+        high = self._fresh_high(rng, fine_tuning.learning_rate)
+        task = TaskLearning(steps, self.config, torch.Generator().manual_seed(int(rng.integers(2**63))))
         task.warm_up(high, bank_errors(low, steps), fine_tuning.steps)
-        *hidden, output = network(high.learned, "high")
-        logits = Layer(output.weight[:-1], output.bias[:-1])
-        return MlshPolicy((*hidden, logits), low, self.config.macro_step, self.normalise)
+        logits = _without_value(network(high.learned, "high"))
+        return MlshPolicy(logits, low, self.config.macro_step, self.normalise)
 
-    def _fresh_high(self, random: np.random.Generator, learning_rate: float) -> Learner:
+    def _fresh_high(self, rng: np.random.Generator, learning_rate: float) -> Learner:
         """Draw a high level; its last output is its value."""
         config = self.config
         sizes = [self.input_dim, *config.hidden, config.sub_skills + 1]
-        return Learner(initialise("high", sizes, random, output_scale=FRESH_SCALE), learning_rate)
+        return Learner(initialise("high", sizes, rng, output_scale=FRESH_SCALE), learning_rate)
 
     def _mode(self, high: Learner, steps: Steps) -> Int[Tensor, " steps"]:
         """Return the most probable sub-skill of each step's macro-step."""
