@@ -19,6 +19,7 @@ from dmil_core.errors import UserError
 from dmil_core.files import create_file, making_folder, read_json
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
+from services.storage.run_folders import SUMMARY
 
 if TYPE_CHECKING:
     from dmil_core.checkpoint import Checkpoint
@@ -50,7 +51,6 @@ def run(arguments: Sequence[str]) -> None:
         raise UserError(f"FOLDER: got {args.folder}, which is there already; wanted the name of a new folder")
     from dmil_core.checkpoint import Checkpoint
     from dmil_core.model import load
-    from services.evaluation.expectation import FIGURES
     from services.reporting.model_card import CARD, model_card
 
     checkpoint = load(args.run, args.runs).checkpoint
@@ -60,7 +60,7 @@ def run(arguments: Sequence[str]) -> None:
         for name, content in files.items():
             create_file(made, name, content)
         shipped = summary.model_copy(update={"checkpoint_digest": Checkpoint(made).digest})
-        create_file(made, FIGURES, (shipped.model_dump_json(indent=1) + "\n").encode())
+        create_file(made, SUMMARY, (shipped.model_dump_json(indent=1) + "\n").encode())
         size = sum(map(len, files.values()))
         create_file(made, CARD, model_card(args.folder.name, checkpoint, summary, size).encode())
     console.print(f"{args.folder}: {size / 1e6:.1f} MB; to evaluate it: dmil evaluate {shlex.quote(str(args.folder))}")
@@ -68,18 +68,18 @@ def run(arguments: Sequence[str]) -> None:
 
 def _figures(checkpoint: "Checkpoint", folder: Path) -> "Summary":
     """Return the summary of an evaluation without what is only of the machine that it was made on."""
-    from services.evaluation.expectation import FIGURES, MOST_BYTES
+    from services.evaluation.expectation import MOST_BYTES
     from services.evaluation.summary import Summary
 
     advice = (
         "wanted the summary of an evaluation of the run's newest checkpoint: dmil evaluate RUN, then --figures FOLDER"
     )
-    if not (folder / FIGURES).is_file():
-        raise UserError(f"{folder}: got no {FIGURES}; {advice}")
-    summary = read_json(folder, FIGURES, Summary, MOST_BYTES, advice)
+    if not (folder / SUMMARY).is_file():
+        raise UserError(f"{folder}: got no {SUMMARY}; {advice}")
+    summary = read_json(folder, SUMMARY, Summary, MOST_BYTES, advice)
     if summary.checkpoint_digest != checkpoint.digest:
         got, wanted = summary.checkpoint_digest[:12], checkpoint.digest[:12]
-        raise UserError(f"{folder / FIGURES}: checkpoint_digest: got {got}; wanted {wanted}, of {checkpoint.path}")
+        raise UserError(f"{folder / SUMMARY}: checkpoint_digest: got {got}; wanted {wanted}, of {checkpoint.path}")
     return summary.model_copy(update={"checkpoint": "", "report": "", "mlflow_run_id": None})
 
 

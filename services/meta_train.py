@@ -32,7 +32,7 @@ from services.distributed.cluster import RunnerKind
 from services.storage.folder_lock import held
 from services.storage.redaction import redacted
 from services.storage.remote import STORAGE
-from services.storage.run_folders import find_folder, make_folder, new_name, resume_command
+from services.storage.run_folders import CONFIG, find_folder, make_folder, new_name, resume_command
 from services.tracking.links import database, tracking_uri
 from services.tracking.system import recording_system
 from services.tracking.tracker import Tracker, record_settings
@@ -42,8 +42,6 @@ if TYPE_CHECKING:
     from services.experiments.experiment import Experiment
     from services.storage.checkpoints import Checkpoints
 
-MARK = "config.json"
-"""What a run's folder is known by."""
 MOST_BYTES = 2**20
 """In it."""
 
@@ -116,7 +114,7 @@ def run(arguments: Sequence[str]) -> None:
     )
     experiment.read_sources()
     if args.resume is None:
-        make_folder(folder, {MARK: args.experiment.model_dump_json(indent=1) + "\n"})
+        make_folder(folder, {CONFIG: args.experiment.model_dump_json(indent=1) + "\n"})
     with held(folder):
         if args.resume is None:
             claim_name(folder)
@@ -134,9 +132,9 @@ def _carry_out(args: Arguments, folder: Path, experiment: "Experiment") -> None:
     checkpoints = Checkpoints(folder / "checkpoints", config.training.checkpoints_kept)
     checkpoint = checkpoints.newest() if checkpoints.all() else None
     if checkpoint is not None:
-        check_settings(checkpoint, experiment.config, folder / MARK)
+        check_settings(checkpoint, experiment.config, folder / CONFIG)
     clock = Clock()
-    write_file(folder, MARK, config.model_dump_json(indent=1) + "\n")
+    write_file(folder, CONFIG, config.model_dump_json(indent=1) + "\n")
     with Tracker(folder, f"dmil-{config.suite.name}") as tracker, _telling_how_to_go_on(folder, checkpoints):
         record_settings(tracker, config)
         with (
@@ -160,7 +158,7 @@ def _carry_out(args: Arguments, folder: Path, experiment: "Experiment") -> None:
             evaluation = experiment.evaluate(runner, data, trained, folder)
             controls = experiment.evaluate_controls(runner, data, evaluation, folder)
             clock.lap("evaluate")
-        check_folder(folder, MARK)
+        check_folder(folder, CONFIG)
         summary = conclude(evaluation, controls, folder, tracker, clock)
         tracker.model(trained.path, experiment.held_out_sets(data)[experiment.tasks[-1][1]][:1])
     show(summary, tracker.address_lines)
@@ -202,9 +200,9 @@ def _read(arguments: Sequence[str]) -> tuple[Arguments, Path]:
     wanted = Path(early.resume) if Path(early.resume).name != early.resume else runs / early.resume
     if restored(wanted):
         console.print(f"fetched from {redacted(os.environ[STORAGE])}: {wanted}")
-    folder = find_folder(early.resume, runs, MARK)
+    folder = find_folder(early.resume, runs, CONFIG)
     try:
-        before = ExperimentConfig.model_validate_json(read_file(folder, MARK, MOST_BYTES))
+        before = ExperimentConfig.model_validate_json(read_file(folder, CONFIG, MOST_BYTES))
     except (OSError, ValidationError) as error:
         got = describe_errors(error) if isinstance(error, ValidationError) else error
         raise UserError(f"{folder / 'config.json'}: {got}; start a new run") from error

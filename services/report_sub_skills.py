@@ -1,8 +1,8 @@
 """Write a page on the sub-skills that runs take in some tasks, side by side: the paper's Figure 4.
 
-For example, with the variants of a sweep: python -m services.report sub-skills DMIL=trained/DIGEST OptionGAIL=NAME
---tasks hand-insert push-around-wall. The tasks may be any of the runs' kind of robot, also such as no run has; the
-experts demonstrate those that there are no demonstrations of.
+For example, with the variants of a sweep: dmil report sub-skills DMIL=trained/DIGEST OptionGAIL=NAME --tasks
+hand-insert push-around-wall. The tasks may be any of the runs' kind of robot, also such as no run has; the experts
+demonstrate those that there are no demonstrations of.
 """
 
 from collections.abc import Sequence
@@ -16,15 +16,12 @@ from dmil_core.errors import UserError
 from services.cli.arguments import parse
 from services.cli.places import announce
 from services.reporting.options import EMBEDDING_SHOTS, PERPLEXITY, SEED
-from services.storage.run_folders import find_folder
+from services.storage.run_folders import CONFIG, find_folder
 
 if TYPE_CHECKING:
     from services.experiments.finished_run import FinishedRun
     from services.reporting.page import DataTable
     from services.reporting.run_group import RunGroup
-
-MARK = "config.json"
-"""What the folder of a run, or of a configuration that a sweep has trained, is known by."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +88,7 @@ def _labelled_runs(which: Sequence[str], runs: Path) -> "dict[str, FinishedRun]"
     by_label: dict[str, FinishedRun] = {}
     for named in which:
         label, _, name = named.rpartition("=")
-        run = FinishedRun(find_folder(name, runs, MARK, "RUN"))
+        run = FinishedRun(find_folder(name, runs, CONFIG, "RUN"))
         if (label := label or run.name) in by_label:
             raise UserError(f"RUN: got {label} twice; wanted each once, or labels to tell them apart: LABEL=RUN")
         by_label[label] = run

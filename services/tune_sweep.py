@@ -24,13 +24,12 @@ from services.demonstrations.store import DATA, data_root, open_store
 from services.distributed.cluster import joined
 from services.storage.folder_lock import held
 from services.storage.provenance import git_commit, library_versions
-from services.storage.run_folders import find_folder, new_name, resume_command
+from services.storage.run_folders import IDENTITY, find_folder, new_name, resume_command
 from services.suites.registry import open_suite
 from services.sweeps.folders import MARK, SweepFolder, SweepRecord
 from services.sweeps.settings import Preset, Sweep, planned
 from services.tracking.delivery import Identity
 from services.tracking.links import comparison_link, database, tracking_uri
-from services.tracking.ownership import IDENTITY
 from services.tracking.system import recording_system
 from services.tracking.tracker import Tracker
 

@@ -8,11 +8,10 @@ from dmil_core.errors import UserError
 from dmil_core.files import read_json
 from dmil_core.statistics import interval_text
 from services.evaluation.summary import Summary, SummaryRow
+from services.storage.run_folders import SUMMARY
 
-FIGURES = "summary.json"
-"""Beside a model's manifest: the summary of its run."""
 MOST_BYTES = 2**24
-"""In it."""
+"""Of the summary beside a model's manifest, which is that of its run."""
 
 
 class Verdict(NamedTuple):
@@ -29,12 +28,12 @@ def expected_rows(checkpoint: Checkpoint, tasks: Collection[str]) -> list[Summar
     Raises:
         UserError: if it comes without figures, or with none of these tasks.
     """
-    if not (checkpoint.path / FIGURES).is_file():
+    if not (checkpoint.path / SUMMARY).is_file():
         raise UserError(
-            f"--expect: got {checkpoint.path}, without a {FIGURES}; wanted a model that comes with the project, as "
+            f"--expect: got {checkpoint.path}, without a {SUMMARY}; wanted a model that comes with the project, as "
             "ml10; or leave the flag out"
         )
-    summary = read_json(checkpoint.path, FIGURES, Summary, MOST_BYTES, "wanted a run's; export the model again")
+    summary = read_json(checkpoint.path, SUMMARY, Summary, MOST_BYTES, "wanted a run's; export the model again")
     rows = [row for row in summary.rows if row.split == "meta-testing"]
     of_tasks = [row for row in rows if set(row.per_task) == set(tasks)]
     if not of_tasks:

@@ -17,6 +17,7 @@ from services.cli.escapes import for_markdown
 from services.evaluation.controls import HEAD, ControlRow, said
 from services.evaluation.paper_results import Published, figure_of
 from services.evaluation.results import AdaptationResult, EpisodeResult, grouped
+from services.storage.run_folders import SUMMARY
 from services.suites.base import Split
 
 BEST = 5
@@ -374,4 +375,4 @@ def markdown_rows(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[st
 
 def write_summary(summary: Summary, folder: Path) -> None:
     """Write ``summary.json``."""
-    write_file(folder, "summary.json", summary.model_dump_json(indent=1) + "\n")
+    write_file(folder, SUMMARY, summary.model_dump_json(indent=1) + "\n")

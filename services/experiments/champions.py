@@ -19,12 +19,12 @@ from services.evaluation.results import EvaluationFolder
 from services.evaluation.summary import Evaluation
 from services.experiments.experiment import Experiment
 from services.storage.redaction import error_line, redacted
+from services.storage.run_folders import IDENTITY
 from services.suites.registry import open_suite
 from services.tracking.client import connect
 from services.tracking.delivery import Identity
 from services.tracking.links import tracking_uri
 from services.tracking.models import CHECKPOINT_TAG, download, models_of
-from services.tracking.ownership import IDENTITY
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -87,7 +87,7 @@ def _model_of(client: "MlflowClient", checkpoint: Checkpoint) -> "LoggedModel":
         got = f"of which MLflow run {run_id} has no model, and {len(models)} of others"
     raise UserError(
         f"--checkpoint: got {checkpoint.path}, {got}; wanted the last checkpoint of a finished run of "
-        "services.meta_train; what MLflow did not take while the run was on it takes by: "
+        "dmil meta-train; what MLflow did not take while the run was on it takes by: "
         f"dmil tracking flush {home}"
     )
 

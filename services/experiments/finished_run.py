@@ -6,6 +6,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
+from dmil_core.checkpoint import FOLDER as CHECKPOINTS
 from dmil_core.checkpoint import Checkpoint
 from dmil_core.configs import ExperimentConfig
 from dmil_core.errors import UserError
@@ -16,18 +17,16 @@ from services.evaluation.results import AdaptationResult, EpisodeResult, Evaluat
 from services.evaluation.summary import Summary
 from services.experiments.experiment import Experiment
 from services.storage.checkpoints import Checkpoints
-from services.storage.run_folders import find_folder, resume_command
+from services.storage.run_folders import CONFIG, SUMMARY, find_folder, resume_command
 from services.tracking.history import Origin, read_metrics, read_origin
 
 Result = TypeVar("Result", EpisodeResult, AdaptationResult)
-MARK, BEGUN, CHECKPOINTS = "summary.json", "config.json", "checkpoints"
-"""What the folder of a finished run is known by, what that of any run, and what no evaluation's has."""
 REPORT, PAGE = "report", "report.html"
 """The folder of reports in a run's, and the page in it."""
 EVALUATED = "evaluation.json"
 """In the folder of an evaluation: the settings that were in force."""
 MOST_BYTES = 2**24
-"""In it."""
+"""Of a summary or of settings."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +41,13 @@ class FinishedRun(EvaluationFolder):
             UserError: if there is no folder of a run, it has not come to its end, or it is only an evaluation's.
         """
         try:
-            folder = find_folder(name, runs, MARK, "RUN")
+            folder = find_folder(name, runs, SUMMARY, "RUN")
         except UserError as error:
             for begun in (Path(name), runs / name):
-                if (begun / BEGUN).is_file():
+                if (begun / CONFIG).is_file():
                     raise UserError(
-                        f"RUN: got {begun}, which has not come to its end; wanted a finished run, with a {MARK}; go on "
-                        f"with it: {resume_command(begun)}"
+                        f"RUN: got {begun}, which has not come to its end; wanted a finished run, with a {SUMMARY}; "
+                        f"go on with it: {resume_command(begun)}"
                     ) from error
             raise
         if not (folder / CHECKPOINTS).is_dir() and not (folder / EVALUATED).is_file():
@@ -76,7 +75,7 @@ class FinishedRun(EvaluationFolder):
             UserError: if the file is not as a run writes it.
         """
         advice = f"write it again: {resume_command(self.folder)}"
-        return read_json(self.folder, MARK, Summary, MOST_BYTES, f"wanted what a run writes at its end; {advice}")
+        return read_json(self.folder, SUMMARY, Summary, MOST_BYTES, f"wanted what a run writes at its end; {advice}")
 
     @cached_property
     def episodes(self) -> list[EpisodeResult]:
@@ -97,7 +96,7 @@ class FinishedRun(EvaluationFolder):
         if strange := sorted({row.checkpoint for row in rows} - {wanted}):
             raise UserError(
                 f"{self.folder / name}: checkpoint: got rows of {strange[0][:12]}; wanted those of {wanted[:12]}, as "
-                f"checkpoint_digest in {MARK} says; restore both, or write them again: {resume_command(self.folder)}"
+                f"checkpoint_digest in {SUMMARY} says; restore both, or write them again: {resume_command(self.folder)}"
             )
         return rows
 

@@ -19,6 +19,8 @@ from services.evaluation.summary import (
     write_summary,
 )
 from services.experiments.finished_run import PAGE, REPORT, FinishedRun
+from services.storage.run_folders import SUMMARY
+from services.tracking.spool import NOTE
 from services.tracking.tracker import Tracker
 
 
@@ -51,9 +53,9 @@ def publish(tracker: Tracker, summary: Summary, folder: Path) -> None:
     if summary.faults:
         tracker.tags({"simulator_faults": summary.faults})
     tracker.metrics(Checkpoint(Path(summary.checkpoint)).manifest.iteration, metrics, anew=True)
-    tracker.tags({"mlflow.note.content": table_markdown(summary)})
+    tracker.tags({NOTE: table_markdown(summary)})
     tracker.artifact(folder / REPORT, REPORT)
-    for name in ("summary.json", "episodes.jsonl"):
+    for name in (SUMMARY, "episodes.jsonl"):
         tracker.artifact(folder / name)
 
 

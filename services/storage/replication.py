@@ -17,14 +17,12 @@ from services.storage.checkpoints import Checkpoints
 from services.storage.folder_lock import held
 from services.storage.redaction import error_line
 from services.storage.remote import Storage, given_storage
+from services.storage.run_folders import CONFIG, IDENTITY, SPOOL, SUMMARY
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
-IDENTITY, SPOOL, SETTINGS = "mlflow_run.json", "tracking.jsonl", "config.json"
-RECORDS = (
-    IDENTITY, SPOOL, SETTINGS, "metrics.json", "adaptations.jsonl", "episodes.jsonl", "summary.json",
-)  # fmt: skip
+RECORDS = (IDENTITY, SPOOL, CONFIG, "metrics.json", "adaptations.jsonl", "episodes.jsonl", SUMMARY)
 """What else a run needs to go on, and to be looked at. The first says how far MLflow has taken the second: it is read
 before it and written after it, so that the copy never says that more was taken than it holds."""
 EVALUATIONS, EVALUATED, ROWS = "evaluations", r"\d{7,}", ("adaptations.jsonl", "episodes.jsonl")
@@ -62,7 +60,7 @@ class Replica:
         if self._claimed:
             return
         tag, place = self._tag(), f"{self._name}/{CLAIM}"
-        taken = self._get(CLAIM, MOST_CLAIM) is None and self._get(SETTINGS) is not None  # by a version without claims
+        taken = self._get(CLAIM, MOST_CLAIM) is None and self._get(CONFIG) is not None  # by a version without claims
         if tag is None:  # so is this one
             tag, taken = self.new_tag(), False
         if taken or self._storage.create(place, tag, MOST_CLAIM) != tag:
@@ -138,7 +136,7 @@ class Replica:
         tag = self._tag()
         if tag is not None and tag != self._get(CLAIM, MOST_CLAIM):
             return False
-        return bool(self._newer()) if (self._folder / SETTINGS).exists() else self._get(SETTINGS) is not None
+        return bool(self._newer()) if (self._folder / CONFIG).exists() else self._get(CONFIG) is not None
 
     def _newer(self) -> list[str]:
         """Return the stored checkpoints that are newer than all whole ones in the folder, the newest first."""
@@ -268,7 +266,7 @@ def restored(folder: Path) -> bool:
     except UserError:
         raise
     except Exception as error:
-        if (folder / SETTINGS).is_file():
+        if (folder / CONFIG).is_file():
             logger.warning(f"{storage.url} does not give {folder} ({error_line(error)}); going on with what is here")
             return False
         if isinstance(error, RunError):

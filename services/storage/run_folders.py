@@ -9,6 +9,10 @@ from pathlib import Path
 from dmil_core.errors import UserError, shorten
 from dmil_core.files import ForeignFileError, at_home, create_file, inside, making_folder, room_for
 
+CONFIG, SUMMARY = "config.json", "summary.json"
+"""In a run's folder: the settings, there from its begin on, and the summary, there once it has ended."""
+SPOOL, IDENTITY = "tracking.jsonl", "mlflow_run.json"
+"""In a run's folder: the records for MLflow, and which MLflow run takes them and how many it has taken."""
 MOST_BYTES = 255 - len(".checkpoint")
 """Of a name, as file systems have it; some room is left for names that are made of it."""
 FORMS = ("NFC", "NFD")

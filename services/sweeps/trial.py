@@ -26,6 +26,7 @@ from services.storage.checkpoints import Checkpoints
 from services.storage.folder_lock import held
 from services.storage.remote import given_storage
 from services.storage.replication import replicated
+from services.storage.run_folders import CONFIG
 from services.sweeps.folders import TRAINED, SweepFolder, TrialResult, evaluated, trained
 from services.sweeps.settings import PlannedTrial
 from services.tracking.history import read_metrics
@@ -113,7 +114,7 @@ def _run(sweep: SweepFolder, trial: PlannedTrial, store: DemoStore, tracker: Tra
                 checkpoints = Checkpoints(home / "checkpoints", config.training.checkpoints_kept)
                 checkpoint = checkpoints.newest() if checkpoints.all() else None
                 if checkpoint is None or checkpoint.manifest.iteration < config.training.iterations:
-                    write_file(home, "config.json", config.model_dump_json(indent=1) + "\n")
+                    write_file(home, CONFIG, config.model_dump_json(indent=1) + "\n")
                     checkpoint = experiment.train(
                         runner, data, checkpoints, tracker, checkpoint, overlap_evaluation=False
                     )

@@ -19,7 +19,7 @@ from dmil_core.files import inside
 from services.cli.arguments import exit_code, parse
 from services.cli.progress import console
 from services.storage.redaction import error_line, redacted
-from services.storage.run_folders import find_folder
+from services.storage.run_folders import SPOOL, find_folder
 from services.tracking.delivery import REFUSED, Delivery
 from services.tracking.links import PORT, artifacts_beside, tracking_uri
 from services.tracking.spool import Artifact, Spool
@@ -54,11 +54,11 @@ def run(arguments: Sequence[str]) -> None:
     uri = tracking_uri()
     if args.action == "ui":
         _serve(uri, args.port)
-    folder = find_folder(args.run, args.runs, "tracking.jsonl", "RUN")
+    folder = find_folder(args.run, args.runs, SPOOL, "RUN")
     if args.action == "report":
         _report(folder, uri)
         return
-    trials = sorted(spool.parent.relative_to(folder) for spool in folder.glob("trials/*/tracking.jsonl"))  # of a sweep
+    trials = sorted(spool.parent.relative_to(folder) for spool in folder.glob(f"trials/*/{SPOOL}"))  # of a sweep
     for own in (folder, *(inside(folder, trial) for trial in trials)):
         delivery = Delivery(own, uri)
         try:
@@ -91,7 +91,7 @@ def _flush(delivery: Delivery, folder: Path, uri: str) -> None:
         raise RunError(
             f"MLflow at {redacted(uri)} does not take records: {error_line(error)}; "
             f"{delivery.identity.delivered - before} of {waiting} were delivered, the others wait in "
-            f"{folder / 'tracking.jsonl'}; set MLFLOW_TRACKING_URI to the MLflow that the run began with, and "
+            f"{folder / SPOOL}; set MLFLOW_TRACKING_URI to the MLflow that the run began with, and "
             "flush again"
         ) from None  # its text may hold secrets
     console.print(
@@ -108,7 +108,7 @@ def _report(folder: Path, uri: str) -> None:
     delivery = Delivery(folder, uri)
     try:
         _flush(delivery, folder, uri)  # nobody else delivers, and so records, from here on
-        spool = Spool(folder / "tracking.jsonl")
+        spool = Spool(folder / SPOOL)
         spool.append("artifact", Artifact(path=REPORT, folder=REPORT))
         spool.close()
         _flush(delivery, folder, uri)

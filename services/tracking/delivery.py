@@ -12,15 +12,15 @@ from uuid import uuid4
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from dmil_core.errors import RunError, UserError
+from dmil_core.errors import RunError, UserError, describe_errors
 from dmil_core.files import append_to, check_folder, read_file, room_for, sync, write_file
 from services.storage.folder_lock import FolderHeldError, held
 from services.storage.redaction import error_line
+from services.storage.run_folders import IDENTITY, SPOOL
 from services.tracking.client import connect, set_mlflow_defaults
 from services.tracking.links import artifacts_beside
 from services.tracking.ownership import (
     FOLDER_TAG,
-    IDENTITY,
     IDENTITY_BYTES,
     RUN_TAG,
     check_active,
@@ -86,7 +86,7 @@ class Identity(BaseModel):
         try:
             return Identity.model_validate_json(read_file(folder, IDENTITY, IDENTITY_BYTES))
         except (OSError, ValidationError) as error:
-            got = error.strerror if isinstance(error, OSError) else "; ".join(_problems(error))
+            got = error.strerror if isinstance(error, OSError) else describe_errors(error, "no object", "; ")
             raise UserError(
                 f"{path}: got {got}; wanted what a tracked run writes there: the id of its MLflow run; put it back, or "
                 "delete it, and the next --resume gives the run's records to a new MLflow run"
@@ -142,7 +142,7 @@ class Delivery:
         Raises:
             UserError: if one is damaged.
         """
-        return list(read_spool(self._folder / "tracking.jsonl", line=self.identity.delivered, offset=self._offset))
+        return list(read_spool(self._folder / SPOOL, line=self.identity.delivered, offset=self._offset))
 
     def busy(self) -> bool:
         """Tell whether another process is at it."""
@@ -164,7 +164,7 @@ class Delivery:
             RunError: if the folder is gone.
             MlflowException: or whatever else MLflow and what is below it raise, if it does not take a record.
         """
-        check_folder(self._folder, "tracking.jsonl")
+        check_folder(self._folder, SPOOL)
         self.take_over()
         waiting = self.waiting()
         if not waiting:
@@ -174,7 +174,7 @@ class Delivery:
             batch = self._send(client, run_id, next_batch(waiting))
             waiting = waiting[len(batch) :]
             # Records must not be noted as delivered that a power failure would take back.
-            sync(self._folder / "tracking.jsonl")
+            sync(self._folder / SPOOL)
             self._offset = batch[-1].end
             self._note(delivered=batch[-1].number)
 
@@ -218,7 +218,7 @@ class Delivery:
         self._offset = self._delivered_bytes()
 
     def _delivered_bytes(self) -> int:
-        path, count = self._folder / "tracking.jsonl", self.identity.delivered
+        path, count = self._folder / SPOOL, self.identity.delivered
         ends = [line.end for line in islice(read_spool(path), count)]
         if len(ends) < count:
             raise UserError(
@@ -293,7 +293,9 @@ class Delivery:
         try:
             self.identity = Identity.model_validate(self.identity.model_dump() | changed)
         except ValidationError as error:
-            raise RunError(f"MLflow answered with no id of its own: {'; '.join(_problems(error))}") from error
+            raise RunError(
+                f"MLflow answered with no id of its own: {describe_errors(error, 'no object', '; ')}"
+            ) from error
         write_file(self._folder, IDENTITY, self.identity.model_dump_json())
 
 
@@ -305,8 +307,3 @@ def _is_for_good(error: Exception) -> bool:
         return False
     status = error.get_http_status_code()
     return 400 <= status < 500 and status not in AGAIN
-
-
-def _problems(error: ValidationError) -> Iterator[str]:
-    for problem in error.errors(include_url=False):
-        yield f"{'.'.join(map(str, problem['loc'])) or 'no object'}: {problem['msg']}"

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import NamedTuple
 
+from services.storage.run_folders import SPOOL
 from services.tracking.spool import read_spool
 
 
@@ -22,7 +23,7 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
         UserError: names the line that is damaged.
     """
     by_step: dict[int, dict[str, float]] = {}
-    for line in read_spool(folder / "tracking.jsonl"):
+    for line in read_spool(folder / SPOOL):
         if line.kind == "metrics":
             by_step.setdefault(line.value.step, {"iteration": line.value.step}).update(line.value.values)
     return [by_step[step] for step in sorted(by_step)]
@@ -35,7 +36,7 @@ def read_origin(folder: Path) -> Origin:
         UserError: names the line that is damaged.
     """
     commits, data_sets = [], {}
-    for line in read_spool(folder / "tracking.jsonl"):
+    for line in read_spool(folder / SPOOL):
         if line.kind == "tags" and "git_commit" in line.value:
             commits.append(line.value["git_commit"])
         elif line.kind == "inputs":

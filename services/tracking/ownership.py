@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 from dmil_core.errors import RunError, UserError
 from dmil_core.files import read_file
 from services.storage.redaction import redacted
+from services.storage.run_folders import IDENTITY
 from services.tracking.links import artifacts_beside
 
 if TYPE_CHECKING:
@@ -23,8 +24,6 @@ RUN_TAG = "dmil.run"
 """The tag by which a run is found again whose id was never noted."""
 FOLDER_TAG = "dmil.folder"
 """Where the run's folder is."""
-IDENTITY = "mlflow_run.json"
-"""In a run's folder."""
 IDENTITY_BYTES = 10_000
 
 

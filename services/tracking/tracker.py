@@ -13,6 +13,7 @@ from dmil_core.errors import RunError
 from services.cli.composition import flat
 from services.storage.provenance import git_commit, library_versions
 from services.storage.redaction import error_line, redacted
+from services.storage.run_folders import SPOOL
 from services.tracking.delivery import Delivery, Identity
 from services.tracking.links import run_link, tracking_uri, ui_command
 from services.tracking.packing import packed
@@ -50,7 +51,7 @@ class Tracker:
         """Of MLflow, without secrets."""
         self._folder = folder
         Identity.find_or_make(folder, experiment, None if parent is None else Identity.of(parent).tag)
-        self._spool = Spool(folder / "tracking.jsonl")
+        self._spool = Spool(folder / SPOOL)
         self._delivery = Delivery(folder, uri)
         self._opened = time.monotonic()
         self._closing = threading.Event()

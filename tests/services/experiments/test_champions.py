@@ -14,8 +14,8 @@ from services.demonstrations.store import DemoStore
 from services.evaluation.comparison import Difference
 from services.evaluation.results import EpisodeResult, read_rows
 from services.experiments.champions import is_better
+from services.storage.run_folders import IDENTITY
 from services.tracking.__main__ import run as tracking_program
-from services.tracking.ownership import IDENTITY
 from tests.services.conftest import without_pictures
 from tests.services.programs import Server
 
