@@ -323,9 +323,9 @@ def newest(folder: Path, warn: Callable[[str], object]) -> Checkpoint:
     """
     checkpoint, complaints = newest_whole(folder)
     if checkpoint is None:
-        damaged = f"{len(complaints)} checkpoints, none of them whole" if complaints else "no checkpoint"
+        got = f"{len(complaints)} checkpoints, none of them whole" if complaints else "no checkpoint"
         advice = "put a whole one there, or remove them and begin anew" if complaints else "train first"
-        raise CheckpointError("\n".join([f"{folder}: got {damaged}; wanted one; {advice}", *complaints]))
+        raise CheckpointError("\n".join([f"{folder}: got {got}; wanted one; {advice}", *complaints]))
     if complaints:
         warn(f"{' | '.join(complaints)}; taking {checkpoint.path} instead")
     return checkpoint
@@ -363,7 +363,7 @@ def read_manifest(path: Path) -> Manifest:
             continue  # a model to adapt
         size = (path / name).stat().st_size if (path / name).is_file() else 0
         if size < least:
-            raise CheckpointError(f"{path / name}: got {size} bytes; wanted at least {least}; use another checkpoint")
+            raise damaged(path / name, f"{size} bytes", f"at least {least}")
     return manifest
 
 
