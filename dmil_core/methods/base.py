@@ -51,7 +51,7 @@ class Policy(ABC):
     """A policy adapted to one task, acting in several episodes in lockstep.
 
     What it must remember between steps it returns as `memory`, one row an episode, and receives again at the next
-    step: the caller drops the rows of finished episodes. As it stands here it remembers nothing and has one sub-skill.
+    step: the caller drops the rows of finished episodes. By default it remembers nothing and has one sub-skill.
     """
 
     def start(self, episodes: int) -> Int64[np.ndarray, "episodes memory_dim"]:
@@ -92,7 +92,7 @@ OBSERVATION_FLOOR, FEATURE_FLOOR = 0.02, 0.05
 
 
 def features_of(config: MethodConfig, points: Points | None) -> RelativeFeatures | None:
-    """Return what turns observations into features, if it is not they that networks see.
+    """Return the map from observations to features, or None if networks see the observations themselves.
 
     Raises:
         UserError: for relative features without an object among the points.
@@ -179,8 +179,8 @@ class Method(ABC, Generic[Config]):
     def initial_parameters(self, rng: np.random.Generator) -> Parameters:
         """Draw the initial parameters, which may be none."""
 
-    def practice(self, support: Sequence[Demonstration], fine_tuning: FineTuning) -> Steps:
-        """Return the steps to fine-tune on: the support set, with displaced copies if there are to be any."""
+    def support_steps(self, support: Sequence[Demonstration], fine_tuning: FineTuning) -> Steps:
+        """Return the steps to fine-tune on: those of the support set and, if asked for, of its displaced copies."""
         return Steps.of(with_copies(support, self.points, fine_tuning.displaced), self.normalise)
 
     @abstractmethod

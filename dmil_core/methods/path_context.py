@@ -1,11 +1,11 @@
-"""The demonstration before a network's eyes: where the demonstrated hand goes next, from the nearest support state.
+"""The path network: it acts by where the demonstrated hand goes next, from the nearest state of each demonstration.
 
-For each support demonstration and each observation: the support state that is nearest in differences of positions; the
-demonstrated path of the hand from there, `HORIZONS` steps ahead, in the frame of the hand itself, of the object and of
-the goal, minus where the hand is; the demonstrated actions there; how far the match is; and what of the state itself is
-the same in every place: gripper, heights, last moves. One network turns each demonstration's row into an action and a
-weight, and the weights' softmax combines the actions. It learns across tasks, from some demonstrations of a task to
-others, and adapts by seeing other demonstrations, not by gradients: a form of in-context imitation (DARP, ICLR 2026).
+Its input is one row for each observation and each support demonstration, whose nearest state is matched first, by
+differences of positions. A row holds the demonstrated path of the hand `HORIZONS` steps ahead of the match, relative to
+the hand and in the frames of hand, object and goal; the demonstrated actions there; the distance of the match; and the
+part of the state that does not depend on place: gripper, heights, last moves. The network turns each row into an action
+and a weight, and the softmax of the weights combines the actions. It is meta-trained to imitate some demonstrations of
+a task given others, and adapts by its input alone, not by gradients: in-context imitation (DARP, ICLR 2026).
 """
 
 import dataclasses
@@ -45,8 +45,8 @@ SHOTS = (1, 3)
 QUERIES, QUERY_STATES = 3, 64
 """Other demonstrations of a task that are imitated in one slot, and states of them in all."""
 DOUBT, JITTER = 0.3, 2
-"""In half of the rows of meta-training the match is made unsure by Gumbel noise of this scale, in half it is off by up
-to so many steps: at test, matches are never as good."""
+"""Noise on the matches of meta-training, as matches are worse at test: with probability 1/2 each, Gumbel noise of this
+scale on the distances, and a shift by up to so many steps."""
 
 
 def _scaled(difference: np.ndarray, reach: float) -> list[np.ndarray]:
@@ -55,14 +55,14 @@ def _scaled(difference: np.ndarray, reach: float) -> list[np.ndarray]:
 
 @dataclass(frozen=True)
 class PathView:
-    """What is seen of a state beside the demonstrations' paths, and by what states are compared."""
+    """The features by which states are matched, and those of the state itself in a row."""
 
     points: Points
     normalise: Normalisation
-    """Compares states where no object is declared."""
+    """Of the observations that are compared where no object is declared."""
 
     def match(self, observations: Float32[np.ndarray, "steps obs_dim"]) -> Float32[np.ndarray, "steps compared"]:
-        """Return numbers whose squared distance says how alike states are."""
+        """Return the features whose squared distance is least between matching states."""
         points = self.points
         if points.object is None:
             return self.normalise(observations)
@@ -90,7 +90,7 @@ class PathView:
         )
 
     def anywhere(self, observations: Float32[np.ndarray, "steps obs_dim"]) -> Float32[np.ndarray, "steps _"]:
-        """Return what of a state does not say where it is: gripper, heights and last moves."""
+        """Return the features of a state that do not depend on place: gripper, heights and last moves."""
         points = self.points
         if points.object is None:
             return np.zeros((len(observations), 0), np.float32)
@@ -111,15 +111,15 @@ class PathView:
 
 @dataclass(frozen=True)
 class _Seen:
-    """A demonstration as it is looked at, step by step."""
+    """The features of a demonstration at each step."""
 
     compared: Float32[np.ndarray, "steps compared"]
     anywhere: Float32[np.ndarray, "steps _"]
     frames: Sequence[tuple[Float32[np.ndarray, "steps axes"], tuple[int, ...] | None]]
-    """Places of the frames' origins, and where those are in an observation; None for a frame that stays. That of the
-    hand shows what the demonstrated one does next."""
+    """Origins of the frames, and which numbers of an observation they are; None for a frame that does not move. In that
+    of the hand, the path is where the demonstrated hand goes from the match."""
     ahead: Float32[np.ndarray, "steps horizons axes"]
-    """The hand's places from each step on."""
+    """The hand's positions `HORIZONS` steps ahead."""
     actions: Float32[np.ndarray, "steps action_dim"]
     others: Float32[np.ndarray, "steps _"]
     """At the same horizons, the numbers of the actions that do not move the hand."""
@@ -127,18 +127,18 @@ class _Seen:
 
 @dataclass(frozen=True)
 class PathContext:
-    """Demonstrations before a network's eyes."""
+    """The demonstrations in a path network's input."""
 
     view: PathView
     seen: tuple[_Seen, ...]
 
     @classmethod
     def of(cls, demonstrations: Sequence[Demonstration], view: PathView) -> "PathContext":
-        """Look at some demonstrations of one task."""
+        """Compute the features of some demonstrations of one task."""
         points = view.points
         axes = (points.hand, points.object, points.goal) if points.object is not None else (points.hand, None)
 
-        def look(one: Demonstration) -> _Seen:
+        def seen(one: Demonstration) -> _Seen:
             steps = np.arange(len(one))
             later = np.minimum(steps[:, None] + HORIZONS, len(one) - 1)
             hand = position(one.observations, points.hand, points)
@@ -151,16 +151,16 @@ class PathContext:
                 one.actions[later, len(points.hand) :].reshape(len(one), -1),
             )
 
-        return cls(view, tuple(map(look, demonstrations)))
+        return cls(view, tuple(map(seen, demonstrations)))
 
     def rows(
         self, observations: Float32[np.ndarray, "steps obs_dim"], rng: np.random.Generator | None = None
     ) -> Float[Tensor, "rows features"]:
-        """Return what is seen at each observation of each demonstration, the demonstrations of a step side by side.
+        """Return the network's input: the rows of all demonstrations for the first observation, then for the next.
 
         Args:
-            observations: what is acted on.
-            rng: makes the matches worse, as in meta-training; without it they are the nearest.
+            observations: those to act on.
+            rng: source of the noise on the matches in meta-training; without it, the nearest states are matched.
         """
         compared, anywhere = self.view.match(observations), self.view.anywhere(observations)
         rows = [self._row(observations, compared, anywhere, seen, rng) for seen in self.seen]
@@ -195,13 +195,13 @@ class PathContext:
 
 
 def combined(outputs: Float[Tensor, "rows outputs"], demonstrations: int) -> Float[Tensor, "steps action_dim"]:
-    """Return the action at each step: the demonstrations' own, weighted by the softmax of their last output."""
+    """Return the action at each step: the mean over demonstrations, weighted by the softmax of the last outputs."""
     of_each = outputs.unflatten(0, (-1, demonstrations))
     return (of_each[..., :-1] * of_each[..., -1:].softmax(1)).sum(1)
 
 
 def sample_path_batch(demonstrations: Sequence[Demonstration], rng: np.random.Generator) -> PathBatch:
-    """Draw one or three demonstrations of a task to see, and others to imitate; a set never sees itself."""
+    """Draw one or three demonstrations of a task as context and up to three others to imitate; a single one is both."""
     order, shots = rng.permutation(len(demonstrations)), int(rng.choice(SHOTS))
     shots = min(shots, max(1, len(order) - 1))
     drawn = [demonstrations[index] for index in order]
@@ -211,7 +211,7 @@ def sample_path_batch(demonstrations: Sequence[Demonstration], rng: np.random.Ge
 def _drawn(
     batch: PathBatch, view: PathView
 ) -> tuple[Float[Tensor, "rows features"], Float[Tensor, "states action_dim"]]:
-    """Return what is seen at states of the batch's queries, and the actions there."""
+    """Return the network's input at states of the batch's queries, and the demonstrated actions there."""
     rng = np.random.default_rng(batch.seed)
     observations = np.concatenate([one.observations for one in batch.query])
     chosen: Int[np.ndarray, " states"] = rng.integers(0, len(observations), QUERY_STATES)
@@ -220,7 +220,7 @@ def _drawn(
 
 
 def path_gradient(network: Network, batch: PathBatch, view: PathView) -> LossGradient:
-    """Return the squared error of what the network does at states of the batch's queries, and its gradient."""
+    """Return the network's squared error at states of the batch's queries, and its gradient."""
     rows, actions = _drawn(batch, view)
 
     def loss(outputs: Tensor) -> Tensor:
@@ -248,7 +248,7 @@ def path_gradients(network: Network, batches: Sequence[PathBatch], view: PathVie
 
 @dataclass(frozen=True)
 class PathGuide:
-    """What a policy does with a path network: its action is part of the policy's."""
+    """A path network with its demonstrations, whose action is part of a policy's."""
 
     network: Network
     context: PathContext
@@ -264,7 +264,7 @@ class PathGuide:
 
 
 def view_of(method: Method[Any]) -> PathView | None:
-    """Return what a method's path network sees, if it has one.
+    """Return the features of a method's path network, if it has one.
 
     Raises:
         UserError: if it has one, and no points are declared.
@@ -298,7 +298,7 @@ def with_path(
 def with_path_gradient(
     method: Method[Any], result: TaskGradient, parameters: Parameters, batch: TaskBatch
 ) -> TaskGradient:
-    """Return the gradient with that of the path network, whose part is zero so far, if a method has one."""
+    """Return the gradient with the path network's added, whose entries are zero so far, if a method has one."""
     if (view := view_of(method)) is None:
         return result
     assert batch.path is not None
@@ -331,7 +331,7 @@ def with_path_gradients(
 
 
 def guide_of(method: Method[Any], parameters: Parameters, support: Sequence[Demonstration]) -> PathGuide | None:
-    """Return the path network before a support set, if a method has one."""
+    """Return the path network with a support set as its context, if a method has one."""
     if (view := view_of(method)) is None:
         return None
     layers = network(without_graph(parameters), "path")

@@ -46,6 +46,6 @@ class BehaviourCloning(MetaLearner[BehaviourCloningConfig, TaskBatch]):
 
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> NetworkPolicy:
         """Take plain gradient steps on the support set, as DMIL's inner loop does, or Adam's on batches."""
-        steps = self.practice(support, fine_tuning)
+        steps = self.support_steps(support, fine_tuning)
         adapted = fine_tuned(network(parameters, "policy"), steps, torch.optim.SGD, fine_tuning)
         return NetworkPolicy(adapted, self.normalise, guide_of(self, parameters, support))

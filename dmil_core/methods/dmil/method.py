@@ -66,7 +66,7 @@ class Dmil(MetaLearner[DmilConfig, TaskBatch]):
 
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> DmilPolicy:
         """Run the dual inner loop with the support set as both τ1 and τ2, or both levels' losses down by Adam."""
-        steps, hierarchy = self.practice(support, fine_tuning), Hierarchy.of(parameters)
+        steps, hierarchy = self.support_steps(support, fine_tuning), Hierarchy.of(parameters)
         if fine_tuning.optimiser == "adam":
             adapted = adaptation.adapt_by_adam(hierarchy, steps, self.config, fine_tuning)
         else:

@@ -24,7 +24,7 @@ class PerTask(Method[PerTaskConfig]):
 
     def adapt(self, parameters: Parameters, support: Sequence[Demonstration], fine_tuning: FineTuning) -> NetworkPolicy:
         """Take steps of Adam on the support set."""
-        steps = self.practice(support, fine_tuning)
+        steps = self.support_steps(support, fine_tuning)
         return NetworkPolicy(
             fine_tuned(network(parameters, "policy"), steps, torch.optim.Adam, fine_tuning), self.normalise
         )

@@ -1,4 +1,4 @@
-"""The demonstration before a network's eyes."""
+"""The path network: its input, its gradient and its part in a policy."""
 
 from collections.abc import Sequence
 from typing import Any
