@@ -28,6 +28,8 @@ RUNS: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
 }
 """The commands of each run, one after the other."""
+NEWER = ("diverged", "sub_skill_switches")
+"""Fields of rows that came after the digests were written down."""
 
 
 def processor() -> str:
@@ -50,7 +52,7 @@ def digests(folder: Path) -> dict[str, str]:
     found = {"parameters": hashlib.sha256((last / "parameters.safetensors").read_bytes()).hexdigest()}
     for name in ("episodes", "adaptations"):
         rows = [json.loads(line) for line in (folder / f"{name}.jsonl").read_text().splitlines()]
-        left_out = ("versions", "checkpoint", "diverged")  # the last is newer than the digests
+        left_out = ("versions", "checkpoint", *NEWER)
         kept = [{key: value for key, value in row.items() if key not in left_out} for row in rows]
         found[name] = hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
     return found
