@@ -15,17 +15,11 @@ from dmil_core.methods.per_task.method import PerTask
 from dmil_core.methods.tracking.method import Tracking
 
 OURS: dict[str, type[Method[Any]]] = {
-    "dmil": Dmil,
-    "option-gail": OptionGail,
-    "option-gail-offline": OptionGailOffline,
-    "mil": Mil,
-    "mlsh": Mlsh,
-    "pemirl": Pemirl,
-    "behaviour-cloning": BehaviourCloning,
-    "per-task": PerTask,
-    "nearest-neighbour": NearestNeighbour,
-    "tracking": Tracking,
-}
+    method.config_type.model_fields["name"].default: method
+    for method in (
+        Dmil, OptionGail, OptionGailOffline, Mil, Mlsh, Pemirl, BehaviourCloning, PerTask, NearestNeighbour, Tracking,
+    )
+}  # fmt: skip
 
 
 def method_type(name: object) -> type[Method[Any]]:

@@ -71,10 +71,6 @@ class Levels(NamedTuple):
             each_tensor(low, lambda tensor: tensor.repeat(tasks, *[1] * (tensor.ndim - 1))),
         )
 
-    def zeros(self) -> "Levels":
-        """Return zeros in the place of all parameters."""
-        return Levels(each_tensor(self.high, torch.zeros_like), each_tensor(self.low, torch.zeros_like))
-
     def flat(self, tasks: int, like: Parameters) -> Float[Tensor, "tasks size"]:
         """Return each task's numbers as `dmil_core.networks.flatten` has them; zeros for parameters of other names."""
         parts, named = [], {**parameters_of(self.high, "high"), **parameters_of(self.low, "low")}
@@ -111,7 +107,7 @@ def task_gradients(
     given = _labels(_errors(levels.low, four, k), four.counts, config) if on_labels else chosen
     of_low = _sub_skill_gradient(levels.low, _own_steps(four, given, k))
 
-    vector = levels.zeros()
+    vector = Levels(*(each_tensor(level, torch.zeros_like) for level in levels))
     of_high.add_to(vector.high)
     of_low.add_to(vector.low)
     if second:
