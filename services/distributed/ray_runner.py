@@ -85,24 +85,21 @@ class RayRunner:
         Raises:
             UserError: if there must be a GPU, and the cluster has none.
         """
-        self._cluster = ExitStack()
-        self._cluster.enter_context(joined(workers))
-        import ray
+        with ExitStack() as opening:
+            opening.enter_context(joined(workers))
+            import ray
 
-        from services.distributed.actor_pool import Pool
+            from services.distributed.actor_pool import Pool
 
-        self._ray, self._pool = ray, Pool
-        self._requested, self._compute = workers, compute
-        if workers is not None and workers > cpus():
-            logger.info(f"--workers {workers}: the cluster has {cpus()} CPUs now; further workers join as it grows")
-        self.meter: Meter = RayMeter(suite.name)
-        self._counter = WorkerCounter("simulation", self.meter)
-        try:
+            self._ray, self._pool = ray, Pool
+            self._requested, self._compute = workers, compute
+            if workers is not None and workers > cpus():
+                logger.info(f"--workers {workers}: the cluster has {cpus()} CPUs now; further workers join as it grows")
+            self.meter: Meter = RayMeter(suite.name)
+            self._counter = WorkerCounter("simulation", self.meter)
             self._gpus = gpus_of_each(compute, gpus, self._wanted_workers)
             self._suite = put_suite(suite, ray.put)
-        except UserError:
-            self._cluster.close()
-            raise
+            self._cluster = opening.pop_all()
         self._background: Pool | None = None
         self._training: RayMetaTraining | None = None
 

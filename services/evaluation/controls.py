@@ -130,7 +130,7 @@ def _nested(values: Mapping[tuple[Any, ...], float]) -> list[list[list[float]]]:
     return [list(draws.values()) for draws in tasks.values()]
 
 
-def said(rows: Sequence[ControlRow]) -> list[str]:
+def control_sentences(rows: Sequence[ControlRow]) -> list[str]:
     """Return in a sentence for each size of support set what fine-tuning added, and how the best control compares."""
     sentences = []
     for shots in sorted({row.shots for row in rows}):

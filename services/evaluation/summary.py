@@ -14,7 +14,7 @@ from dmil_core.files import write_file
 from dmil_core.settings import MethodConfig
 from dmil_core.statistics import interval_text, mean_score, share_entropy, success_rate
 from services.cli.escapes import for_markdown
-from services.evaluation.controls import HEAD, ControlRow, said
+from services.evaluation.controls import HEAD, ControlRow, control_sentences
 from services.evaluation.paper_results import Published, figure_of
 from services.evaluation.results import AdaptationResult, EpisodeResult, grouped
 from services.storage.run_folders import SUMMARY
@@ -323,7 +323,8 @@ def table_markdown(summary: Summary) -> str:
         lines += ["", *markdown_rows(head, tasks)]
     if summary.controls:
         rows = (row.fields for row in summary.controls)
-        lines += ["", *markdown_rows(HEAD, rows), "", *(f"{sentence}." for sentence in said(summary.controls))]
+        sentences = [f"{sentence}." for sentence in control_sentences(summary.controls)]
+        lines += ["", *markdown_rows(HEAD, rows), "", *sentences]
     warnings = "".join(f"{for_markdown(words)}.\n\n" for words in (summary.faults, diverged_of(summary)) if words)
     return f"Success rates of {for_markdown(described(summary))}.\n\n{warnings}" + "\n".join(lines) + "\n"
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from dmil_core.checkpoint import Checkpoint
 from dmil_core.files import inside, write_file
 from services.cli.progress import Clock, aside, console
-from services.evaluation.controls import ControlRow, said
+from services.evaluation.controls import ControlRow, control_sentences
 from services.evaluation.summary import (
     Evaluation,
     Summary,
@@ -64,7 +64,7 @@ def show(summary: Summary, addresses: Sequence[str] = ()) -> None:
     console.print(table(summary))
     if summary.controls:
         console.print(control_table(summary))
-        for sentence in said(summary.controls):
+        for sentence in control_sentences(summary.controls):
             console.print(sentence)
     for split, use in summary.sub_skills.items():
         shares = ", ".join(f"{share:.2f}" for share in use.share)

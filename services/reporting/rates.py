@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
 from dmil_core.statistics import Mean, interval_text, mean_score, success_rate
-from services.evaluation.controls import HEAD, said
+from services.evaluation.controls import HEAD, control_sentences
 from services.evaluation.results import EpisodeResult, grouped
 from services.evaluation.summary import against_collapse, described, diverged_of, headline
 from services.experiments.finished_run import FinishedRun
@@ -69,7 +69,7 @@ def table_of_all(finished: FinishedRun) -> list[Part]:
     if summary.controls:
         rows = [row.fields for row in summary.controls]
         parts.append(DataTable("Controls, in the same episodes of new tasks", HEAD, rows))
-        parts.append(Prose(" ".join(f"{sentence}." for sentence in said(summary.controls))))
+        parts.append(Prose(" ".join(f"{sentence}." for sentence in control_sentences(summary.controls))))
     return [*parts, Prose(f"Shots are demonstrations adapted to. Intervals are {intervals}{beside}.")]
 
 

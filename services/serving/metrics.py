@@ -9,7 +9,7 @@ from prometheus_client.registry import Collector
 
 LATENCIES = (0.001, 0.002, 0.004, 0.008, 0.02, 0.05, 0.1, 0.5, 2.0, 10.0)
 """Bounds of the classes of latencies, in seconds."""
-Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
+Samples = Mapping[tuple[str, tuple[tuple[str, str], ...]], float]
 """Figures by name and labels."""
 
 
@@ -49,7 +49,7 @@ class Metrics:
             if not sample.name.endswith("_created")
         }
 
-    def text(self, totals: Mapping[tuple[str, tuple[tuple[str, str], ...]], float], **gauges: float) -> bytes:
+    def text(self, totals: Samples, **gauges: float) -> bytes:
         """Return figures in Prometheus' format: the sums of all replicas' `samples`, and others by name."""
         registry = CollectorRegistry()
         registry.register(_Totals(list(self._registry.collect()), totals, gauges))
@@ -57,7 +57,7 @@ class Metrics:
 
 
 class _Totals(Collector):
-    def __init__(self, known: list[Metric], totals: Samples | Mapping, gauges: Mapping[str, float]) -> None:
+    def __init__(self, known: list[Metric], totals: Samples, gauges: Mapping[str, float]) -> None:
         self._known, self._totals, self._gauges = known, totals, gauges
 
     def collect(self) -> list[Metric]:
