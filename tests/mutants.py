@@ -57,7 +57,7 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
     },
     ("dmil_core/statistics.py", "dmil_core/test_statistics.py"): {
         "z**2) / whole": "0) / whole",
-        "draw.integers(seeds, size=BOOTSTRAP_DRAWS)": "[place] * BOOTSTRAP_DRAWS",
+        "rng.integers(seeds, size=BOOTSTRAP_DRAWS)": "[place] * BOOTSTRAP_DRAWS",
     },
     ("dmil_core/methods/ppo.py", "dmil_core/methods/test_ppo.py"): {
         "ratio.clamp(1 - clip, 1 + clip)": "ratio",
