@@ -14,7 +14,18 @@ from services.sweeps.settings import Range, Sweep, planned
 from services.tune_sweep import CONFIGS
 from tests.services.sweeps.made_up import better, make
 
-NAMES = ["bilevel", "continuity", "em", "finetune_steps", "kitchen_k", "methods", "negatives", "search", "sub_skills"]
+NAMES = [
+    "bilevel",
+    "continuity",
+    "em",
+    "finetune_steps",
+    "hierarchy",
+    "kitchen_k",
+    "methods",
+    "negatives",
+    "search",
+    "sub_skills",
+]
 SMALL = {"what": "a test", "suites": ["ml10"], "seeds": [0], "variants": {"one": {}}}
 
 
