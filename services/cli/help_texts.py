@@ -1,16 +1,26 @@
 """What programs say of themselves and of their flags: `--help` in paragraphs, and in one line what a flag may be."""
 
 import dataclasses
+import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
-from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructTypeInfo,
+)
 
 from dmil_core.errors import describe_errors
+from services.cli.yaml_files import INTEGER, REAL
 
+NUMBERS = {int: (INTEGER, "an integer, as 10"), float: (rf"{REAL}|[-+]?inf|nan", "a number, as 0.1 or 1e-3")}
+"""How numbers are written on the command line, and the words for it."""
 REPORTS = {
     kind: f"services.report_{kind.replace('-', '_')}"
     for kind in ("run", "compare", "sub-skills", "video", "gallery", "tables")
@@ -45,7 +55,7 @@ def flowing(text: str) -> str:
 
 
 def flowing_registry() -> ConstructorRegistry:
-    """Return what has tyro show the texts of settings as paragraphs."""
+    """Return what has tyro show the texts of settings as paragraphs, and take as a number what is one in a file."""
     registry, asked = ConstructorRegistry(), list[StructTypeInfo]()
 
     @registry.struct_rule
@@ -59,6 +69,26 @@ def flowing_registry() -> ConstructorRegistry:
             return None
         fields = tuple(dataclasses.replace(field, helptext=_flown(field.helptext)) for field in spec.fields)
         return dataclasses.replace(spec, fields=fields, instantiate=_told(spec.instantiate))
+
+    @registry.primitive_rule
+    def number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[float] | None:
+        if info.type not in NUMBERS:
+            return None
+        kind, (form, wanted) = info.type, NUMBERS[info.type]
+
+        def read(texts: list[str]) -> float:
+            if not re.fullmatch(form, texts[0]):
+                raise ValueError(f"got {texts[0]!r}; wanted {wanted}")
+            return int(texts[0], 0) if kind is int else float(texts[0])
+
+        numeric = (int, float) if kind is float else int
+        return PrimitiveConstructorSpec(
+            nargs=1,
+            metavar=kind.__name__.upper(),
+            instance_from_str=read,
+            is_instance=lambda value: isinstance(value, numeric) and not isinstance(value, bool),
+            str_from_instance=lambda value: [str(value)],
+        )
 
     return registry
 

@@ -15,6 +15,9 @@ MOST_BYTES = 2**16
 DEEPEST = 20
 MOST_CHARACTERS = 500
 """Of what PyYAML says."""
+INTEGER = r"[-+]?(?:0|[1-9][0-9]*)|0o[0-7]+|0x[0-9a-fA-F]+"
+REAL = r"[-+]?(?:\.[0-9]+|(?:0|[1-9][0-9]*)(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+"""What is a number, in files and on the command line alike."""
 
 
 def merged(settings: Mapping[str, Any], values: Mapping[Any, Any], origin: str, prefix: str = "") -> dict[str, Any]:
@@ -101,9 +104,8 @@ class _PlainLoader(yaml.SafeLoader):
 
 for _tag, _form, _first in (
     ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
-    ("int", r"[-+]?(0|[1-9][0-9]*)|0o[0-7]+|0x[0-9a-fA-F]+", "-+0123456789"),
-    ("float", r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
-     "-+.0123456789"),
+    ("int", INTEGER, "-+0123456789"),
+    ("float", rf"{REAL}|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", "-+.0123456789"),
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
 ):  # fmt: skip
     _PlainLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(rf"^(?:{_form})$"), list(_first))

@@ -72,6 +72,28 @@ def test_yaml_that_says_one_thing_is_taken(tmp_path: Path):
     assert (config.seed, config.suite.goal_visible, config.demonstrations.source) == (16, False, "off")
 
 
+@dataclass(frozen=True)
+class Numbers:
+    """Arguments of a program."""
+
+    whole: int | None = None
+    real: float = 0.0
+    several: tuple[int, ...] = ()
+
+
+@pytest.mark.parametrize("flag", ["--whole", "--real", "--several"])
+@pytest.mark.parametrize("text", ["010", "1_0", "١٢", " 3 ", "1:30", "true"])
+def test_a_flag_refuses_what_is_no_number_in_yaml(flag: str, text: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit, match="2"):
+        parse(Numbers, "", [flag, text], Numbers())
+    assert flag in capsys.readouterr().err
+
+
+def test_a_flag_takes_what_is_a_number_in_yaml():
+    arguments = ["--whole", "0x10", "--real", "-1.5e-3", "--several", "1", "+3"]
+    assert parse(Numbers, "", arguments, Numbers()) == Numbers(16, -0.0015, (1, 3))
+
+
 @pytest.mark.parametrize("seed", ["7", True, 3.0])
 def test_json_refuses_what_yaml_does(seed: object):
     settings = json.dumps({"seed": seed})
