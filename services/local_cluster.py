@@ -251,18 +251,17 @@ def _check_port(flag: str, port: int) -> None:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers do: closed connections do not count
         try:
             probe.bind(("127.0.0.1", port))
-        except OSError as error:
-            raise UserError(
-                f"{flag}: got {port}, where {_listener_name(port)} listens; wanted a free one; stop that, or give "
-                "another"
-            ) from error
+        except (OSError, OverflowError) as error:
+            listener = _listener_name(port)
+            why = f"where {listener} listens" if listener else f"which cannot be listened on ({error})"
+            raise UserError(f"{flag}: got {port}, {why}; wanted a free one; stop that, or give another") from error
 
 
-def _listener_name(port: int) -> str:
+def _listener_name(port: int) -> str | None:
     for connection in psutil.net_connections("tcp"):
         if connection.status == psutil.CONN_LISTEN and tuple(connection.laddr)[1:] == (port,) and connection.pid:
             return f"{psutil.Process(connection.pid).name()} (process {connection.pid})"
-    return "somebody"
+    return None
 
 
 def _check_space(folder: Path, needed: int, remedy: str) -> None:

@@ -230,3 +230,10 @@ def test_an_empty_token_is_made_anew_and_a_link_is_refused(complaint, own_token:
     token.symlink_to(other)
     said = complaint(local_cluster.run, "start", "--object-store-megabytes", "100000000")
     assert "token: got a link, or another user's; wanted your own" in said
+
+
+@pytest.mark.parametrize("port", ["-1", "65536"])
+def test_a_port_that_there_is_not_is_named(complaint, own_token: None, tmp_path: Path, monkeypatch, port: str):
+    monkeypatch.chdir(tmp_path)
+    said = complaint(local_cluster.run, "start", "--ray-port", port)
+    assert f"--ray-port: got {port}, which cannot be listened on (bind(): port must be 0-65535.)" in said
