@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import errno
 import os
 import signal
 import sys
@@ -83,6 +84,10 @@ def parse(program: type[T], description: str, arguments: Sequence[str], defaults
     return dataclasses.replace(read, **paths, **told)  # type: ignore[type-var]  every program's is a dataclass
 
 
+MISNAMED = {errno.ENAMETOOLONG, errno.ENOTDIR, errno.EEXIST, errno.EISDIR}
+"""What is wrong with a path whose name is too long, or where a file stands for a folder or the other way round."""
+
+
 def exit_code(program: Callable[[Sequence[str]], None], arguments: Sequence[str]) -> int:
     """Run a program, with what is logged on the console, and return its exit code.
 
@@ -96,7 +101,7 @@ def exit_code(program: Callable[[Sequence[str]], None], arguments: Sequence[str]
             if (told := _told(error)) is None:
                 raise
             print(f"error: {for_terminal(told)}", file=sys.stderr)
-            return 2 if isinstance(error, UserError) else 1
+            return 2 if isinstance(error, UserError) or getattr(error, "errno", None) in MISNAMED else 1
         except KeyboardInterrupt:
             return 128 + (received or [signal.SIGINT])[0]
     return 0

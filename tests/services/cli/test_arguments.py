@@ -14,7 +14,8 @@ import pytest
 import services
 from dmil_core.configs import PRESETS
 from dmil_core.errors import UserError
-from services.cli.arguments import PROGRAMS, parse
+from dmil_core.files import open_file
+from services.cli.arguments import PROGRAMS, exit_code, parse
 from services.cli.composition import config_from
 from services.cli.help_texts import COMMANDS
 from services.meta_train import Arguments, run
@@ -163,6 +164,15 @@ def test_a_mistake_ends_the_program_with_exit_code_2(programs):
     assert code == 2
     assert "third" in printed
     assert "Traceback" not in printed
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "file/below"])
+def test_a_path_that_there_cannot_be_is_a_mistake_too(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "file").touch()
+    assert exit_code(lambda arguments: open_file(tmp_path, name).close(), []) == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith(f"error: {tmp_path}/{name[:4]}")
+    assert printed.count("\n") == 1
 
 
 EXPLAINED = [path.stem for path in sorted(SERVICES.glob("[a-z]*.py")) if path.stem != "checkpoints"]
