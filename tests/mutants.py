@@ -116,7 +116,7 @@ FAULTS: dict[tuple[str, ...], dict[str, str]] = {
         "suite or named or DEFAULT_SUITE": "named or DEFAULT_SUITE",
     },
     ("services/cli/arguments.py", "services/cli/test_arguments.py"): {
-        "2 if isinstance(error, UserError) else 1": "1",
+        "2 if isinstance(error, UserError) or": "2 if",
     },
 }
 """Of each file, before the tests that mirror it: a text that occurs once in it, and what to put in its place."""

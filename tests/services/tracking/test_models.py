@@ -78,7 +78,7 @@ def test_it_acts_as_the_adapted_policy_step_by_step(untrained, kind: type[Imitat
         asked = packed(support, observation) | {"memory": remembered}
         answer = imitator.answer(asked, STEPS)
         rounding = 0 if kind is Imitator else 1e-5  # version 0.1 laid its parameters out in another order
-        np.testing.assert_allclose(np.float32(answer["action"]), decision.actions[0], rounding)
+        np.testing.assert_allclose(np.float32(answer["action"]), decision.actions[0], rounding, rounding)
         assert answer["sub_skill"] == decision.sub_skills[0]
         if "support_id" in answer:
             by_id = imitator.answer(asked | {"support": None, "support_id": answer["support_id"]}, STEPS)
