@@ -22,11 +22,13 @@ from services.storage.run_folders import CONFIG, IDENTITY, SPOOL, SUMMARY
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
-RECORDS = (IDENTITY, SPOOL, CONFIG, "metrics.json", "adaptations.jsonl", "episodes.jsonl", SUMMARY)
+ROWS = ("adaptations.jsonl", "episodes.jsonl")
+"""Of an evaluation; those of episodes say that it is whole."""
+RECORDS = (IDENTITY, SPOOL, CONFIG, "metrics.json", *ROWS, SUMMARY)
 """What else a run needs to go on, and to be looked at. The first says how far MLflow has taken the second: it is read
 before it and written after it, so that the copy never says that more was taken than it holds."""
-EVALUATIONS, EVALUATED, ROWS = "evaluations", r"\d{7,}", ("adaptations.jsonl", "episodes.jsonl")
-"""Where the rows of evaluations on the way lie, by iteration; those of episodes say that an evaluation is whole."""
+EVALUATIONS, EVALUATED = "evaluations", r"\d{7,}"
+"""Where the rows of evaluations on the way lie, by iteration."""
 RUNS = "runs"
 CLAIM = "claim"
 """Whose a name is: the random tag of the run that has it, in its folder and in the storage."""
@@ -96,7 +98,7 @@ class Replica:
         """
         self.claim()
         checkpoints = [path.name for path in self._checkpoints.all()]
-        evaluated = [path.name for path in sorted((self._folder / EVALUATIONS).glob("*"))]
+        evaluated = (path.name for path in (self._folder / EVALUATIONS).glob("*"))
         self._copy_records([SPOOL, *_rows_of(name for name in evaluated if re.fullmatch(EVALUATED, name))])
         self._copy_checkpoints(checkpoints)
         self._copy_records(RECORDS)

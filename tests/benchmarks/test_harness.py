@@ -1,6 +1,8 @@
 """Rivals are timed in alternation, and rows come back as they were written."""
 
 import json
+import subprocess
+import sys
 import time
 
 import pytest
@@ -40,3 +42,9 @@ def test_rows_are_read_back_as_written(tmp_path):
     rows = [{"task": "reach", "ratio": 1.5}, {"task": "evaluation", "ratio": 2.0}]
     write_rows(tmp_path / "new" / "rows.json", rows)
     assert json.loads((tmp_path / "new" / "rows.json").read_text()) == rows
+
+
+def test_a_benchmark_is_called_as_its_usage_line_says():
+    asked = [sys.executable, "-m", "benchmarks.sizing", "--help"]
+    told = subprocess.run(asked, capture_output=True, text=True, check=True).stdout
+    assert told.startswith("usage: python -m benchmarks.sizing ")

@@ -138,10 +138,8 @@ def test_an_episode_ends_at_its_first_success(suite, make_envs):
     policy = ExpertPolicy(suite.expert("reach"))
     (episode,) = rollout(policy, [env], [11], HORIZON)
     assert episode.success
-    assert (
-        EpisodeOutcome.of(replace(episode, sub_skills=np.arange(len(episode)) // 4 % 2)).sub_skill_switches
-        == (len(episode) - 1) // 4
-    )
+    switching = replace(episode, sub_skills=np.arange(len(episode)) // 4 % 2)
+    assert EpisodeOutcome.of(switching).sub_skill_switches == (len(episode) - 1) // 4
     assert sum(EpisodeOutcome.of(episode).sub_skill_steps) == len(episode) == len(policy.episode(0)) < HORIZON
     (cut_short,) = rollout(policy, [env], [11], len(episode) - 1)
     assert (cut_short.success, len(cut_short)) == (False, len(episode) - 1)
